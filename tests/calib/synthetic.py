@@ -4,9 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.calibration.model import Calibration
+from calib import Calibration, Ranges
 from calib.calibration.power_curves import Curve
-from calib.data.ranges import Ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 
 DELAYS_NS = {1: -0.36, 2: 0.05, 3: 0.24, 7: -0.11}
@@ -60,3 +59,10 @@ def design(some, tags):
     """Return the derivative of calibrated ranges by delays, in metres a nanosecond, written out (n, tags)."""
     ends = (some.initiator, some.weight_initiator), (some.target, some.weight_target)
     return sum((ids[:, None] == np.array(tags)) * weight[:, None] for ids, weight in ends) * SPEED_OF_LIGHT * 1e-9
+
+
+def about_their_mean(known: Calibration, planted: dict[int, float]):
+    """Return errors of delays about their mean (tags,) and the standard errors of these, in ns, by planted delays."""
+    centre = np.eye(len(planted)) - 1 / len(planted)
+    error = centre @ [known.delays_ns[tag] - delay for tag, delay in planted.items()]
+    return error, np.sqrt(np.diag(centre @ known.covariance_ns2(list(planted)) @ centre))

@@ -75,11 +75,13 @@ def imported(folder, rows, *, swapped=False, mocap=True):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two recordings, fit/d.uwb and fly/d.uwb, and a fit of the one: fit.json."""
+    """Two recordings, fit/d.uwb and fly/d.uwb, and a fit of the one: fit.json, and fit.out and fit.err as printed."""
     found = tmp_path_factory.mktemp("differences")
     imported(found / "fit", flown(1, 60.0))
     imported(found / "fly", flown(2, 20.0))
-    processes.succeed("calib", "fit", "fit/d.uwb", "-o", "fit.json", *FIT, cwd=found)
+    done = processes.succeed("calib", "fit", "fit/d.uwb", "-o", "fit.json", *FIT, cwd=found)
+    (found / "fit.out").write_text(done.stdout)
+    (found / "fit.err").write_text(done.stderr)
     return found
 
 
@@ -93,18 +95,16 @@ def test_delays_come_out_but_for_what_they_have_in_common(folder):
     wrong = found - (DELAYS_NS - DELAYS_NS.mean())
     assert np.all(np.abs(wrong) < 4 * std)
     assert np.sqrt(np.mean((wrong / std) ** 2)) < 1.8, "99.9 % of the roots of chi-square over seven"
-    assert set(known.delays_std_ns.values()) == {np.inf}
-    assert known.undetermined_splits == (((), tuple(range(1, 9))),)
+    assert (set(known.delays_std_ns.values()), known.undetermined_splits) == ({np.inf}, (((), tuple(range(1, 9))),))
     # Noise is that of a difference.
     assert known.sigma_curve(np.ones(1))[0] == pytest.approx(NOISE_M, rel=0.05)
 
 
 def test_the_fit_names_what_stays_free(folder):
-    done = processes.run("calib", "fit", "fit/d.uwb", "-o", "again.json", *FIT, cwd=folder)
-    assert "0 exchanges, 9600 differences of arrival" in done.stdout
-    assert done.stdout.count("less the mean of all") == 8
-    assert "only differences of arrival from tags 1, 2, 3" in done.stderr
-    assert "a common shift of" in done.stderr
+    printed, warned = ((folder / name).read_text() for name in ("fit.out", "fit.err"))
+    assert "0 exchanges, 9600 differences of arrival" in printed
+    assert printed.count("less the mean of all") == 8
+    assert re.search(r"(?s)only differences of arrival from tags 1, 2, 3.*have in common", warned)
     pinned = calib.fit(folder / "fit/d.uwb", use="receptions", delays_only=True, fixed_ns={1: DELAYS_NS[0]}).calibration
     assert not pinned.undetermined_splits
     for tag in range(2, 9):
@@ -122,8 +122,7 @@ def test_they_are_shown_and_not_streamed(folder):
 
 
 def test_no_antenna_delays_are_made_up(folder):
-    contents = uwblink.load(folder / "fly/d.uwb")
-    contents.save(folder / "written.uwb", force=True)
+    uwblink.load(folder / "fly/d.uwb").save(folder / "written.uwb", force=True)
     for name in ("fly/d.uwb", "written.uwb"):
         assert "antenna_delay" not in processes.succeed("uwblink", "show", folder / name).stdout
 
@@ -142,25 +141,19 @@ def test_what_is_not_determined_is_not_corrected(folder):
 
 
 def test_the_tag_is_where_it_is(folder):
-    done = json.loads(
-        processes.succeed(
-            "calib", "localize", "fly/d.uwb", "-c", "fit.json", "--use", "receptions", "--json", cwd=folder
-        ).stdout
-    )
-    (one,) = done["scenarios"]
+    words = ["calib", "localize", "fly/d.uwb", "-c", "fit.json", "--use", "receptions", "--seeds", "1", "--json"]
+    (one,) = json.loads(processes.succeed(*words, cwd=folder).stdout)["scenarios"]
     assert one["arrivals"] == 3200
-    assert one["rmse_m"]["raw"] > 0.08
-    assert one["rmse_m"]["variance"] < 0.045
     assert one["rmse_m"]["robust"] < 0.04
+    assert one["rmse_m"]["variance"] < 0.045 < 0.08 < one["rmse_m"]["raw"]
 
 
 @pytest.mark.parametrize("model", ["constant-velocity", "imu"])
 def test_the_tag_is_tracked_on_board(folder, model):
     contents = uwblink.load(folder / "fly/d.uwb").select(stop_s=6.0)
     time_s = np.arange(0, 20.0, 0.01)
-    rates = np.array([0.5, 0.37, 0.29])
     swing = np.column_stack([2.5 * np.sin(0.5 * time_s), 2.2 * np.cos(0.37 * time_s), 0.7 * np.sin(0.29 * time_s)])
-    force = -(rates**2) * swing + [0.0, 0.0, 9.80665]
+    force = -(np.array([0.5, 0.37, 0.29]) ** 2) * swing + [0.0, 0.0, 9.80665]
     columns = dict(zip(("ax", "ay", "az"), force.T, strict=True)) | dict.fromkeys(("wx", "wy", "wz"), np.zeros(2000))
     imu = {"time_ns": np.rint(time_s * 1e9).astype(np.int64), "body": np.full(2000, "tag20"), **columns}
     settings = calib.OnboardSettings(model=model, use="receptions")
@@ -182,8 +175,7 @@ def test_a_calibration_of_ranges_corrects_differences(folder):
         time_ns=np.rint(time_s * 1e9).astype(np.int64),
     )  # fmt: skip
     known = calib.fit(ranges, delays_only=True, fixed_ns={TAG: 0.1}, between_m=0.0).calibration
-    found = calib.localize(folder / "fly/d.uwb", known, Settings(use="receptions"))
-    total = summarize(found)
+    total = summarize(calib.localize(folder / "fly/d.uwb", known, Settings(use="receptions")))
     assert total.rmse_m["variance"] < 0.045 < 0.08 < total.rmse_m["raw"]
     # The bounds, 2.5 and 3.5, hold 95 %: 0.9 is 3.5 standard deviations. A variance of half as much would give 6.
     assert total.nees == pytest.approx(3.0, abs=0.9)
@@ -295,19 +287,17 @@ def test_ranges_and_differences_are_used_together_and_fitted_apart(folder):
 
 def test_a_recording_keeps_them(folder):
     contents = uwblink.load(folder / "fly/d.uwb")
-    processes.succeed("uwblink", "export", "fly/d.uwb", "--to", "csv", "-o", "exported", cwd=folder)
-    processes.succeed("uwblink", "import", "exported", "exported", "-o", "again.uwb", cwd=folder)
+    for words in ("export fly/d.uwb --to csv -o exported", "import exported exported -o again.uwb"):
+        processes.succeed("uwblink", *words.split(), cwd=folder)
     again = uwblink.load(folder / "again.uwb").differences
     assert all(np.array_equal(again[name], column) for name, column in contents.differences.items())
     some = contents.select(start_s=5.0, stop_s=6.0).differences
-    assert len(some["time_ns"]) == 160
-    assert some["time_ns"][0] == contents.differences["time_ns"][0] + 5 * 10**9
+    assert (len(some["time_ns"]), some["time_ns"][0]) == (160, contents.differences["time_ns"][0] + 5 * 10**9)
     assert "also: differences 3200" in processes.succeed("uwblink", "show", "fly/d.uwb", cwd=folder).stdout
 
 
 def test_delays_less_their_mean_are_drawn_with_their_intervals(folder):
-    found = calib.fit(folder / "fit/d.uwb", use="receptions", delays_only=True)
+    found = calib.fit(folder / "fly/d.uwb", use="receptions", delays_only=True)
     axes = found.plot_delays()
     assert [label.get_text() for label in axes.get_xticklabels()] == [str(tag) for tag in range(1, 9)]
-    points = axes.get_lines()[0].get_ydata()
-    assert np.allclose(points, [found.calibration.delays_ns[tag] for tag in range(1, 9)])
+    assert np.allclose(axes.get_lines()[0].get_ydata(), [found.calibration.delays_ns[tag] for tag in range(1, 9)])

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 import calib
 from calib.estimator.losses import LOSSES
 from calib.figures import binned, cumulative, curve_over_power, delays, histogram, within_fence
-from calib.fitting.fitting import fit
 from calib.report.sections import SECTIONS
 from tests import pages
 from tests.calib.synthetic import bias_m, ranges
@@ -80,7 +79,7 @@ def test_what_is_no_calibration_is_refused_by_its_parameter(tmp_path):
 
 @pytest.fixture(scope="module")
 def fitted():
-    return fit(ranges(12_000, tail=0.2))
+    return calib.fit(ranges(12_000, tail=0.2))
 
 
 def axes_of(draw):
@@ -142,11 +141,8 @@ def test_the_sigma_curve_goes_through_its_points(fitted):
 
 def test_one_stray_delay_does_not_flatten_the_others(fitted):
     known = fitted.calibration
-    wild = replace(
-        known,
-        delays_ns={**known.delays_ns, 9: 1000.0},
-        delays_std_ns={**known.delays_std_ns, 9: 300.0, 1: 40.0},
-    )
+    std_ns = {**known.delays_std_ns, 9: 300.0, 1: 40.0}
+    wild = replace(known, delays_ns={**known.delays_ns, 9: 1000.0}, delays_std_ns=std_ns)
     axes = axes_of(lambda a: delays(wild, axes=a))
     assert np.ptp(axes.get_ylim()) < 3
     assert "+1000.0 ns" in [text.get_text() for text in axes.texts]
@@ -156,38 +152,31 @@ def test_one_stray_delay_does_not_flatten_the_others(fitted):
 
 @pytest.mark.parametrize("offset_m", [0.0, 300.0])
 def test_a_histogram_shows_corrected_errors_whatever_raw_ones_are(fitted, offset_m):
-    some, known = fitted.ranges, fitted.calibration
-    applied = known.apply(some)
+    applied = fitted.calibration.apply(fitted.ranges)
     applied = replace(applied, raw_m=applied.raw_m + offset_m)
-    axes = axes_of(lambda a: histogram(some, applied, a))
+    axes = axes_of(lambda a: histogram(fitted.ranges, applied, a))
     assert np.ptp(axes.get_xlim()) < 400
-    heights = {one.get_label(): one.get_data() for one in axes.patches}
-    assert sum(heights["fully corrected"].values) == pytest.approx(100), "the last bins hold what lies beyond"
-    assert sum(heights["raw"].values) == pytest.approx(100)
+    heights = {one.get_label(): sum(one.get_data().values) for one in axes.patches}
+    # The last bins hold what lies beyond.
+    assert [heights[name] for name in ("raw", "fully corrected")] == pytest.approx([100, 100])
 
 
 def test_the_distribution_says_how_many_errors_are_smaller(fitted):
-    some = fitted.ranges
-    applied = fitted.calibration.apply(some)
-    line = labelled(axes_of(lambda a: cumulative(some, applied, a)), "fully corrected")
-    size = 100 * np.abs(applied.corrected_m - some.truth_m)
+    applied = fitted.calibration.apply(fitted.ranges)
+    line = labelled(axes_of(lambda a: cumulative(fitted.ranges, applied, a)), "fully corrected")
+    size = 100 * np.abs(applied.corrected_m - fitted.ranges.truth_m)
     for x, y in zip(line.get_xdata()[::20], line.get_ydata()[::20], strict=True):
         assert 100 * np.mean(size <= x) == pytest.approx(y, abs=0.1)
 
 
 def test_a_delay_that_nothing_determines_is_a_circle_without_an_interval(fitted):
-    known = fitted.calibration
-    tag = min(known.delays_ns)
-    open_one = replace(known, delays_std_ns=known.delays_std_ns | {tag: np.inf})
-    axes = axes_of(lambda axes: delays(open_one, axes=axes))
-    circle = labelled(axes, "without an interval: pinned or undetermined")
-    assert circle.get_ydata() == pytest.approx([known.delays_ns[tag]])
-    (bars,) = axes.containers
+    known, name = fitted.calibration, "without an interval: pinned or undetermined"
+    open_one = replace(known, delays_std_ns=known.delays_std_ns | {1: np.inf})
+    open_axes, axes = (axes_of(lambda axes, one=one: delays(one, axes=axes)) for one in (open_one, known))
+    assert labelled(open_axes, name).get_ydata() == pytest.approx([known.delays_ns[1]])
+    (bars,) = open_axes.containers
     assert len(bars.lines[0].get_ydata()) == len(known.delays_ns) - 1
-    assert (
-        "without an interval: pinned or undetermined"
-        not in axes_of(lambda axes: delays(known, axes=axes)).get_legend_handles_labels()[1]
-    )
+    assert name not in axes.get_legend_handles_labels()[1]
 
 
 def test_planted_delays_are_drawn_moved_by_the_common_shift(fitted):

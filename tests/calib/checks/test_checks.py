@@ -12,6 +12,7 @@ import pytest
 
 import calib
 import uwblink
+import uwbsim
 from benchmarks import doctor as planted
 from benchmarks.flights import Flight, Plan, fly
 from calib.checks.examine import CHECKS, FINDING_LEVEL, IMPLIED
@@ -19,18 +20,12 @@ from calib.findings import BUDGET, OF_A_FIT, exceeds
 from docs.site import checks
 from tests import processes
 from tests.shared_data import ROOT, shared
-from uwblink.importers import import_recording
-from uwblink.recording.contents import Contents
-from uwblink.recording.file import Recording
 
 RNG = np.random.default_rng
 
 
 def save(flight, path):
-    with Recording.create(path) as recording:
-        recording.append_tags(flight.tags)
-        recording.append_poses(flight.poses)
-        recording.append_exchanges(flight.exchanges)
+    uwblink.Contents(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags).save(path)
     return path
 
 
@@ -118,12 +113,11 @@ def test_markers_that_are_other_radios_are_seen(starloc, tmp_path, marker_of, wr
         table = DictWriter(out, ["range_m" if name == "range" else name for name in names])
         table.writeheader()
         for row in ranges:
-            here = [row[f"tag_pos_{k}"] for k in "xyz"]
             there = markers.get(marker_of[int(float(row["to_id"]))], ["", "", ""])
-            cells = [*(row[name] for name in STARLOC), *here, *there]
+            cells = [*(row[name] for name in STARLOC), *[row[f"tag_pos_{k}"] for k in "xyz"], *there]
             table.writerow(dict(zip(table.fieldnames, cells, strict=True)))
     (tmp_path / "m.toml").write_text('bits = 32\n[units]\nstamps = "ns"\n')
-    import_recording(tmp_path / "t.csv", tmp_path / "t.uwb", map_file=tmp_path / "m.toml")
+    uwblink.import_recording(tmp_path / "t.csv", tmp_path / "t.uwb", map_file=tmp_path / "m.toml")
     found = calib.examine(tmp_path / "t.uwb")
     assert {one.evidence.split()[2] for one in found if one.fault == "anchor stands elsewhere"} == wrong
     assert {"and z from delays" in one.evidence for one in found if " tag12 " in one.evidence} <= {True}
@@ -139,7 +133,7 @@ def test_coarse_ranges_that_follow_fast_are_not_doubled_exchanges(tmp_path):
     ends = ("1,2", "1,3", "2,3")
     lines = [f"{k / 100:.2f},{ends[k % 3]},{r:.2f},{p:.0f},3.0" for k, (r, p) in enumerate(numbers)]
     (tmp_path / "t.csv").write_text("\n".join(["time_s,from_id,to_id,range_m,fpp1,gt_range_m", *lines, ""]))
-    import_recording(tmp_path / "t.csv", tmp_path / "t.uwb")
+    uwblink.import_recording(tmp_path / "t.csv", tmp_path / "t.uwb")
     assert [finding.fault for finding in calib.examine(tmp_path / "t.uwb")] == ["static data"]
 
 
@@ -156,9 +150,9 @@ def test_logs_of_both_robots_are_doubled_exchanges(tmp_path):
         for row in sorted(logged, key=lambda row: float(row["timestamp"])):
             table.writerow(dict(zip(table.fieldnames, (row[theirs] for theirs in names.values()), strict=True)))
     (tmp_path / "m.toml").write_text('bits = 40\n[units]\nstamps = "ns"\n')
-    import_recording(tmp_path / "t.csv", tmp_path / "t.uwb", map_file=tmp_path / "m.toml")
+    uwblink.import_recording(tmp_path / "t.csv", tmp_path / "t.uwb", map_file=tmp_path / "m.toml")
     # The import takes each exchange once; what is made without it is not so careful.
-    with Recording.open(tmp_path / "t.uwb") as recording:
+    with uwblink.Recording.open(tmp_path / "t.uwb") as recording:
         once = recording.exchanges()
     assert len(once) == len(logged) - 123
     assert calib.examine(tmp_path / "t.uwb") == []
@@ -170,7 +164,7 @@ def test_logs_of_both_robots_are_doubled_exchanges(tmp_path):
 def test_power_and_distance_are_not_confounded_outdoors(tmp_path):
     """Two boards on tripods, 2 to 60 m apart: distance explains 82 % of the power, and leaves enough."""
     table = shared("hanyang_sstwr.csv.gz")
-    import_recording(table, tmp_path / "h.uwb", map_file=ROOT / "docs" / "maps" / "hanyang.toml")
+    uwblink.import_recording(table, tmp_path / "h.uwb", map_file=ROOT / "docs" / "maps" / "hanyang.toml")
     # A pole and a tripod do not move, so what is reflected is so for as long as they stand.
     assert {one.fault for one in calib.examine(tmp_path / "h.uwb")} == {
         "too few pairs",
@@ -188,14 +182,12 @@ def test_two_seconds_of_one_pair_say_nothing_of_power_and_distance():
         1, 7, range_m=truth_m + 0.05 * random.standard_normal(rows), truth_m=truth_m, fpp2_dbm=power_dbm,
         time_ns=np.arange(rows) * 10**6,
     )  # fmt: skip
-    assert [one.fault for one in calib.examine(Contents(exchanges=e))] == ["too few pairs"]
+    assert [one.fault for one in calib.examine(uwblink.Contents(exchanges=e))] == ["too few pairs"]
 
 
 @pytest.mark.slow
 def test_a_fit_in_a_room_settles():
     """Steps by the information alone do not settle here in a hundred."""
-    import uwbsim
 
     room = uwbsim.simulate(uwbsim.load("room/room", {"run.duration_s": 60.0, "run.seed": 50_000}))
-    ranges = calib.Ranges.from_exchanges(room.exchanges, poses=room.poses, tags=room.tags)
-    assert calib.fit(ranges.usable()).success
+    assert calib.fit(calib.Ranges.from_exchanges(room.exchanges, poses=room.poses, tags=room.tags).usable()).success

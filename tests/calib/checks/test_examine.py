@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import calib
+import uwbsim
 from benchmarks import doctor as planted
 from benchmarks.flights import LIGHT, Plan, fly
 from uwblink import Contents
@@ -185,7 +186,6 @@ def test_recordings_of_scenarios_without_a_fault_have_no_finding():
     Tags on one frame read powers thirty times those of others: the curve, rough at low powers, is flat between them.
     Among six robots one tag has 5 % of reflected ranges, and the others 2 %.
     """
-    import uwbsim
 
     for name, expected, changed in (
         ("anchors_and_tag/anchors_and_tag", [], {}),
@@ -224,12 +224,10 @@ def test_what_is_no_change_of_one_tags_delay_is_not_called_so(plan, plant):
 
 def test_a_step_is_named_with_tag_size_and_time():
     stepped = longer(-0.09, lambda f: planted.of_tag(f, 21) & (planted.seconds(f) > 25))(fly(SHORT, 44), None)
-    found = only(stepped, "delay changed mid-flight")
-    tag, size_cm, time_s, size_ns, *_ = numbers(found.evidence)
+    tag, size_cm, time_s, size_ns, *_ = numbers(only(stepped, "delay changed mid-flight").evidence)
     assert tag == 21
     # 270 ranges of the tag on either side at 5 cm: a standard error of 0.5 cm.
-    assert size_cm == pytest.approx(-9, abs=1.5)
-    assert time_s == pytest.approx(25, abs=1.5)
+    assert [size_cm, time_s] == pytest.approx([-9, 25], abs=1.5)
     assert size_ns == pytest.approx(0.09 / LIGHT * 2e9, abs=0.1)
 
 
@@ -262,7 +260,6 @@ def test_a_pair_that_does_not_close_is_named_with_its_size(plant, named, size_cm
 
 def test_pairs_that_a_cabinet_hides_are_named():
     """Tag 1 sees the third quadcopter through metal: medians of its two pairs are 25 and 17 cm too long."""
-    import uwbsim
 
     room = uwbsim.simulate(uwbsim.load("room/room", {"run.duration_s": 60.0, "run.seed": 50_004}))
     named = [one.evidence.split()[3] for one in calib.examine(room) if one.fault == "pairs that do not close"]
@@ -355,7 +352,6 @@ def test_where_anchors_stand_is_told_with_intervals_and_as_lines_of_a_map():
 
 def test_ranges_between_anchors_tell_their_places_too():
     """The tags that move say in which direction an anchor is off to 19 cm only."""
-    import uwbsim
 
     flight = uwbsim.simulate(uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.seed": 77_001}))
     true, off = np.array([-2.96, 0.61, 1.66]), np.array([0.2, 0.1, 0.1])
@@ -369,7 +365,6 @@ def test_ranges_between_anchors_tell_their_places_too():
 
 @pytest.mark.parametrize("seed", [77_010, 77_012])
 def test_anchors_that_are_all_off_are_not_taken_for_walls_between_them(seed):
-    import uwbsim
 
     flight = uwbsim.simulate(uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.seed": seed}))
     off = planted.all_anchors_off(flight, RNG(seed))
@@ -389,7 +384,6 @@ def test_anchors_that_are_all_off_are_not_taken_for_walls_between_them(seed):
 
 @pytest.mark.parametrize(("seed", "pair", "either"), [(77_010, (0, 1), True), (77_012, (2, 4), False)])
 def test_a_wall_between_anchors_is_named_and_places_where_they_explain_it(seed, pair, either):
-    import uwbsim
 
     flight = uwbsim.simulate(uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.seed": seed}))
     wall = longer(0.2, lambda f: planted.of_tag(f, pair[0]) & planted.of_tag(f, pair[1]))

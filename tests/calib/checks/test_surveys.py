@@ -9,8 +9,7 @@ from benchmarks.standing import standing_boards
 from calib.checks.examine import examine
 from calib.data.samples import stamped
 from tests.calib.surveys.test_surveying import FOUR
-from uwblink import Arrangement, Contents
-from uwblink.recording.schema import KnownDistance
+from uwblink import Arrangement, Contents, KnownDistance
 
 HELD_NS = 70_000_000_000
 
@@ -39,8 +38,7 @@ def moved():
     world = world_of()
     r = world.ranges
     late = (r.time_ns > 2 * HELD_NS + 25e9) & (r.time_ns < 3 * HELD_NS - 5e9)
-    mine = late & ((r.initiator == 4) | (r.target == 4))
-    return replace(world, ranges=replace(r, raw_m=r.raw_m + 0.2 * mine))
+    return replace(world, ranges=replace(r, raw_m=r.raw_m + 0.2 * (late & ((r.initiator == 4) | (r.target == 4)))))
 
 
 def faults(path):

@@ -20,8 +20,7 @@ def swum(rng: np.random.Generator, bodies: int, time_s: Any) -> Any:
     middle = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), rng.uniform(1, 2, bodies)])
     rate = 2 * np.pi / rng.uniform(4, 15, (bodies, 3, 3))
     phase = rng.uniform(0, 2 * np.pi, rate.shape)
-    waves = np.sin(rate[:, None] * time_s[None, :, None, None] + phase[:, None]).sum(axis=3)
-    return middle[:, None] + 0.45 * waves
+    return middle[:, None] + 0.45 * np.sin(rate[:, None] * time_s[None, :, None, None] + phase[:, None]).sum(axis=3)
 
 
 def field(rng: np.random.Generator, first: Any, second: Any, size_m: float, wave_m: float) -> Any:
@@ -65,8 +64,7 @@ def ranges_with_field(  # noqa: PLR0913 - what a world may differ in
         ends.append(places[body, np.arange(count)] + np.column_stack([c * x - s * y, s * x + c * y, z]))
     truth = np.linalg.norm(ends[0] - ends[1], axis=1)
     powers = -80 - 20 * np.log10(truth / 3) + rng.normal(0, 2.5, (2, count))
-    lifted = np.mean(10 ** ((powers + 82) / 10), axis=0)
-    error = 0.05 * np.sin(1.5 * lifted) + noise_m * rng.normal(size=count)
+    error = 0.05 * np.sin(1.5 * np.mean(10 ** ((powers + 82) / 10), axis=0)) + noise_m * rng.normal(size=count)
     error += np.where(rng.random(count) < reflected, rng.exponential(0.3, count), 0.0)
     for a, b in combinations(range(bodies), 2):
         rows = ((first - 1) // 2 == a) & ((second - 1) // 2 == b)

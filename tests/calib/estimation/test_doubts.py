@@ -7,8 +7,10 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 import calib
+import uwbsim
 from benchmarks.worlds import CLEAN, PLANTED, Recipe, make
 from tests.calib.estimation.fields import ranges_with_field
+from tests.calib.synthetic import about_their_mean
 
 pytestmark = pytest.mark.slow
 
@@ -47,11 +49,8 @@ def planted(name):
 
 def wrong(world, found):
     """Return the errors of delays about their common shift, over their printed standard errors."""
-    tags = list(world.delays_ns)
-    error = np.array([found.calibration.delays_ns[tag] - world.delays_ns[tag] for tag in tags])
-    centre = np.eye(len(tags)) - 1 / len(tags)
-    std = np.sqrt(np.diag(centre @ np.array(found.calibration.uncertainty.delays_ns2) @ centre))
-    return centre @ error / std
+    error, std = about_their_mean(found.calibration, world.delays_ns)
+    return error / std
 
 
 @pytest.mark.parametrize("name", sorted(REFUSED))
@@ -91,8 +90,7 @@ def test_shares_of_reflections_that_differ_by_pair_do_not_pull_delays():
 
 def test_a_recording_too_short_for_its_errors_is_said():
     recipe = Recipe(seconds=20, lasts_s=5, wander_m=0.04, wander_s=10)
-    said = [warning for warning in calib.fit(make(recipe, 1).ranges).warnings if "20 s of data" in warning]
-    assert said
+    assert [warning for warning in calib.fit(make(recipe, 1).ranges).warnings if "20 s of data" in warning]
 
 
 def test_intervals_hold_where_errors_last():
@@ -115,8 +113,7 @@ def distances_late_by(ranges, seconds):
 
 
 def test_late_motion_capture_is_named_and_not_walls():
-    ranges = distances_late_by(ranges_with_field(60_003, bodies=3, seconds=60)[0], 0.02)
-    (said,) = calib.fit(ranges).warnings
+    (said,) = calib.fit(distances_late_by(ranges_with_field(60_003, bodies=3, seconds=60)[0], 0.02)).warnings
     assert "true distances change" in said
     assert "places" not in said
 
@@ -139,7 +136,6 @@ def test_a_sequential_fit_takes_the_curve_for_no_wall():
 @pytest.mark.parametrize(("noise_db", "seed", "place"), [(0.3, 101, False), (1.0, 5, True)])
 def test_noise_of_powers_that_follow_the_distance_is_not_called_places_alone(noise_db, seed, place):
     """Nothing belongs to places here; with much noise in the powers the curve is too flat, which looks so."""
-    import uwbsim
 
     radio = {"first_path_at_1m_dbm": -78.0, "shadowing_db": 0.0, "saturation_dbm": -50.0, "power_noise_db": noise_db}
     settings = {"run.duration_s": 12.0, "run.seed": seed} | {f"radio.{name}": value for name, value in radio.items()}

@@ -11,7 +11,7 @@ from benchmarks.held_back import judged, parts, samples
 from benchmarks.worlds import CLEAN, Recipe, make
 from calib.calibration.formats import read_miluv
 from calib.calibration.power_curves import ALPHA_DBM
-from calib.errors import BadInputError
+from tests.calib.synthetic import about_their_mean
 from tests.shared_data import miluv, shared
 from uwblink.importers import read_source
 
@@ -95,15 +95,14 @@ def test_the_total_sigma_holds_where_reflections_are_of_two_kinds():
     error = applied.corrected_m - ranges.truth_m
     assert np.sqrt(np.mean(applied.sigma_total_m**2)) == pytest.approx(error.std(), rel=0.05)
     # What is written is what is read; a file of one kind is read as before, with the mean error that it had.
-    again = calib.Calibration.from_json(calibration.to_json())
-    assert again == calibration
+    assert calib.Calibration.from_json(calibration.to_json()) == calibration
     table = json.loads(calibration.to_json())
     del table["errors"]["long_share"], table["errors"]["long_factor"]
     older = calib.Calibration.from_json(json.dumps(table)).apply(ranges)
     np.testing.assert_allclose(older.mean_error_m, applied.mean_error_m)
     assert np.all(older.sigma_total_m < applied.sigma_total_m)
     table["errors"] |= {"long_share": 1.5, "long_factor": 4.0}
-    with pytest.raises(BadInputError, match="long_share"):
+    with pytest.raises(calib.BadInputError, match="long_share"):
         calib.Calibration.from_json(json.dumps(table))
 
 
@@ -117,8 +116,7 @@ FEW = "twelve tags, six ranges a pair"
 @pytest.mark.parametrize("seed", [104, 105])
 def test_few_ranges_settle(seed):
     # These two went on for hundreds of steps in directions that no range determines.
-    found = calib.fit(make(CLEAN[FEW], seed).ranges)
-    assert found.success
+    assert calib.fit(make(CLEAN[FEW], seed).ranges).success
 
 
 @pytest.mark.slow
@@ -126,10 +124,7 @@ def test_a_real_flight_among_obstacles_agrees_with_the_published_delays(tmp_path
     ranges = calib.load_ranges(read_source(miluv(tmp_path), importer="miluv"))
     published = read_miluv(shared("miluv_published_calibration.json"))
     known = calib.fit(ranges, loss="cauchy").calibration
-    tags = list(known.uncertainty.tags)
-    centre = np.eye(len(tags)) - 1 / len(tags)
-    error = centre @ [known.delays_ns[tag] - published.delays_ns[tag] for tag in tags]
-    std = np.sqrt(np.diag(centre @ np.array(known.uncertainty.delays_ns2) @ centre))
+    error, std = about_their_mean(known, {tag: published.delays_ns[tag] for tag in known.uncertainty.tags})
     ours, theirs = (each.apply(ranges).delay_corrected_m for each in (known, published))
     assert np.sqrt(np.mean((error / std) ** 2)) < 1.5
     assert np.std(ours - theirs) < 0.06

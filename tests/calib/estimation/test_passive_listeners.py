@@ -5,12 +5,10 @@ from pathlib import Path
 import pytest
 
 import uwblink
-from calib.data.sources import load_ranges
-from calib.fitting.fitting import fit
+from calib import fit, load_ranges
 from calib.fitting.passive_listeners import heard_delays
 from tests.calib.synthetic import calibration
-from uwbsim import simulate
-from uwbsim.scenario.loading import load
+from uwbsim import load, simulate
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 PASSIVE = [f"tags.{k}.passive=true" for k in range(6)]
@@ -49,5 +47,4 @@ def test_they_agree_with_the_fit_of_a_noisy_flight(tmp_path):
 
 
 def test_no_listeners_no_delays(tmp_path):
-    path = recorded(tmp_path, "icra2023/train.toml", "run.duration_s=5")
-    assert heard_delays(path, NOTHING) == {}
+    assert heard_delays(recorded(tmp_path, "icra2023/train.toml", "run.duration_s=5"), NOTHING) == {}

@@ -11,17 +11,15 @@ from calib.checks.limits import power_level_warning, power_levels_db
 from calib.data.ranges import concatenate
 from tests.calib import synthetic
 from tests.calib.estimation.fields import ranges_with_field
-from tests.calib.synthetic import DELAYS_NS, ranges
-from tests.processes import run
+from tests.calib.synthetic import DELAYS_NS, about_their_mean, bias_m, ranges
+from tests.processes import refuse
 from uwblink import Contents
 
 
 def apart(result, planted):
     """Errors of delays about their mean (tags,) in ns, and their standard errors."""
     found = result.calibration
-    centre = np.eye(len(planted)) - 1 / len(planted)
-    error = centre @ (np.array([found.delays_ns[tag] for tag in found.uncertainty.tags]) - planted)
-    return error, np.sqrt(np.diag(centre @ np.array(found.uncertainty.delays_ns2) @ centre))
+    return about_their_mean(found, dict(zip(found.uncertainty.tags, planted, strict=True)))
 
 
 def named(result):
@@ -65,8 +63,7 @@ def test_sound_flights_keep_their_intervals(bodies):
 def test_ranges_know_the_bodies_of_their_tags_as_long_as_recordings_agree():
     ranges, _ = ranges_with_field(3, bodies=3, seconds=2.0)
     assert dict(concatenate([ranges, ranges]).bodies) == dict(ranges.bodies)
-    moved = replace(ranges, bodies=((1, "robot2"), *ranges.bodies[1:]))
-    assert concatenate([ranges, moved]).bodies == ()
+    assert concatenate([ranges, replace(ranges, bodies=((1, "robot2"), *ranges.bodies[1:]))]).bodies == ()
     flight = calib.sample_flight()
     assert {tag.tag: tag.body for tag in flight.tags} == dict(calib.load_ranges(flight).bodies)
 
@@ -99,8 +96,6 @@ def bent(power_dbm):
 
 
 def lifted_bent(r):
-    from tests.calib.synthetic import bias_m
-
     return bias_m(np.mean(10 ** ((np.stack([r.fpp1_dbm, r.fpp2_dbm]) + 82) / 10), axis=0))
 
 
@@ -128,8 +123,7 @@ def test_a_tag_that_reads_too_high_is_named_with_what_its_delay_holds():
     held_ps = float(re.search(r"up to (\d+) ps", said)[1])
     away = np.array([result.calibration.delays_ns[tag] - delay for tag, delay in DELAYS_NS.items()])
     # A shift common to all is the curve's constant, so the others are the reference; a fifth for how the curve bends.
-    of_three = abs(away[2] - np.mean(np.delete(away, 2)))
-    assert 1e3 * of_three == pytest.approx(held_ps, rel=0.2)
+    assert 1e3 * abs(away[2] - np.mean(np.delete(away, 2))) == pytest.approx(held_ps, rel=0.2)
     assert held_ps > 50
 
 
@@ -176,7 +170,6 @@ def test_the_command_writes_nothing_and_ends_with_1(tmp_path, change):
     else:
         exchanges = replace(exchanges, fpp1_dbm=-exchanges.fpp1_dbm, fpp2_dbm=-exchanges.fpp2_dbm)
     Contents(exchanges=exchanges, poses=poses, tags=flight.tags).save(tmp_path / "flight.uwb")
-    done = run("calib", "fit", tmp_path / "flight.uwb", "-o", tmp_path / "c.json")
-    assert done.returncode == 1
-    assert ("millimetres" if change == "poses" else "dBm") in done.stderr
+    named = "millimetres" if change == "poses" else "dBm"
+    refuse("calib", "fit", tmp_path / "flight.uwb", "-o", tmp_path / "c.json", status=1, naming=[named])
     assert [path.name for path in tmp_path.iterdir()] == ["flight.uwb"]

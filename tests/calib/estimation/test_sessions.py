@@ -8,6 +8,7 @@ import pytest
 
 import calib
 from benchmarks.worlds import LIGHT_M_PER_NS, Recipe, make, sigma_m
+from tests.calib.synthetic import about_their_mean
 from tests.processes import run
 
 HOUR_NS = 3_600_000_000_000
@@ -58,21 +59,16 @@ def test_five_short_recordings_of_many_tags_are_one_fit():
     lifted = np.median(np.concatenate([known.lifted(part) for part in parts]))
     # 300 ranges, half of which the unknowns use up, know their noise to 6 %; power has a part in it.
     assert known.sigma_curve(lifted) == pytest.approx(sigma_m(lifted, recipe.noise_m), rel=0.25)
-    apart = np.eye(12) - 1 / 12
-    error = apart @ [known.delays_ns[tag] - delay for tag, delay in planted.items()]
-    assert np.all(np.abs(error) < 3 * np.sqrt(np.diag(apart @ np.array(known.uncertainty.delays_ns2) @ apart)))
+    assert np.abs(np.divide(*about_their_mean(known, planted))).max() < 3
 
 
 @pytest.mark.parametrize(("by_ns", "hours"), [(0.3, 72), (1.5, 1e-5)])
 def test_a_tag_whose_delay_changed_between_sessions_is_named_and_intervals_hold(by_ns, hours):
     known, parts = sessions(hours, moved_ns=by_ns)
     found = calib.fit(parts)
-    said = between(found)
-    assert len(said) == 1
-    assert said[0].startswith("tag 3")
-    assert "monday.uwb" in said[0]
-    assert "tuesday.uwb" in said[0]
-    assert float(said[0].split("p = ")[1].split(")")[0]) < 1e-6
+    (said,) = between(found)
+    assert re.match(r"tag 3.*tuesday\.uwb.*monday\.uwb", said)
+    assert float(said.split("p = ")[1].split(")")[0]) < 1e-6
     delays, covariance = found.calibration.delays_ns, np.array(found.calibration.uncertainty.delays_ns2)
     others = np.array([-1 / 3, -1 / 3, 1, -1 / 3])
     error = others @ [delays[tag] - known[tag] for tag in known]
@@ -168,8 +164,7 @@ def test_the_rate_of_a_drift_is_found_within_its_interval(rate_m2, wander_m):
     # Of 12 intervals that hold with 90 %, 9 or more do in 97 of 100 such studies.
     assert np.sum((low <= rate_m2) & (rate_m2 <= high)) >= 9
     assert 0.4 < np.median(likeliest) / rate_m2 < 2.5
-    assert drifts.mean() > 0.7
-    assert by_age.mean() > 0.2
+    assert (drifts.mean() > 0.7, by_age.mean() > 0.2) == (True, True)
 
 
 @pytest.mark.slow

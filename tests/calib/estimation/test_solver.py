@@ -6,13 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.calibration.comparison import compare
-from calib.calibration.model import Calibration
+from calib import Calibration, UnanswerableError, compare, fit
 from calib.calibration.power_curves import basis, curvature, lifted_power
 from calib.data.ranges import without_static
-from calib.errors import UnanswerableError
 from calib.estimator import known_distances
-from calib.fitting.fitting import fit
 from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
 
 
@@ -28,17 +25,15 @@ def test_the_joint_fit_is_better_where_power_goes_with_the_pair():
     wrong = {}
     for sequential in (False, True):
         c = fit(r, sequential=sequential).calibration
-        error = np.array([c.delays_ns[tag] - d for tag, d in DELAYS_NS.items()])
-        wrong[sequential] = np.std(error)
+        wrong[sequential] = np.std(np.array([c.delays_ns[tag] - d for tag, d in DELAYS_NS.items()]))
     assert wrong[False] < 0.02 < wrong[True]
 
 
 def grouped(r, groups):
     """Give tags of the second group a bias of the opposite sign."""
     other = [0.5 * np.isin(ids, groups["second"]) for ids in (r.initiator, r.target)]
-    share = other[0] + other[1]
     lifted = lifted_power(r.fpp1_dbm, r.fpp2_dbm, "mean-of-lifted", -82.0)
-    return replace(r, raw_m=r.raw_m - 2 * share * bias_m(lifted))
+    return replace(r, raw_m=r.raw_m - 2 * (other[0] + other[1]) * bias_m(lifted))
 
 
 def test_groups_of_tags_get_their_own_curves():
@@ -46,20 +41,16 @@ def test_groups_of_tags_get_their_own_curves():
     c = fit(grouped(ranges(30_000), groups), groups=groups).calibration
     grid = np.linspace(*c.bias_curve.range, 200)
     for name, sign in (("first", 1), ("second", -1)):
-        curve = c.groups[name].bias_curve(grid)
-        planted = sign * bias_m(grid)
-        assert np.std(curve - planted) < 0.006, name
+        assert np.std(c.groups[name].bias_curve(grid) - (sign * bias_m(grid))) < 0.006, name
         assert c.groups[name].bias_curve(np.array([1.0]))[0] == pytest.approx(0, abs=1e-9)
-    again = Calibration.from_json(c.to_json())
-    assert again == c
+    assert Calibration.from_json(c.to_json()) == c
     assert json.loads(c.to_json())["schema_version"] == 2
     # A range between the groups has the mean of both curves, which is none at all here.
     r = grouped(ranges(3000, seed=8), groups)
     applied = c.apply(r)
     assert np.median(np.abs(np.median(applied.corrected_m - r.truth_m))) < 0.02
     mixed = np.isin(r.initiator, (1, 2)) != np.isin(r.target, (1, 2))
-    taken = (applied.delay_corrected_m - applied.corrected_m)[mixed]
-    assert np.std(taken) < 0.006
+    assert np.std((applied.delay_corrected_m - applied.corrected_m)[mixed]) < 0.006
 
 
 def test_a_single_pair_gets_the_smallest_delays():
@@ -68,8 +59,7 @@ def test_a_single_pair_gets_the_smallest_delays():
     assert all(np.isinf(std) for std in c.delays_std_ns.values())
     # Smallest means that both get the same share of what is missing (K is one to a part in 10^5).
     assert c.delays_ns[1] == pytest.approx(c.delays_ns[2], abs=1e-5)
-    again = Calibration.from_json(c.to_json())
-    assert again == c
+    assert Calibration.from_json(c.to_json()) == c
     assert '"1": null' in c.to_json()
     # Two delays less a common shift and the split: nothing is left to compare but the ranges of the pair.
     found = compare(fit(r).calibration, c)
@@ -93,12 +83,9 @@ def test_the_band_holds_the_curve():
     inside = []
     for seed in range(6):
         c = fit(ranges(4000, seed=seed)).calibration
-        low, high = c.bias_curve.range
-        grid = np.linspace(low, high, 50)
+        grid = np.linspace(*c.bias_curve.range, 50)
         wrong = c.bias_curve(grid) - bias_m(grid)
-        band = c.band(grid, "bias")
-        assert band is not None
-        inside.append(np.abs(wrong - wrong.mean()) < 1.96 * band)
+        inside.append(np.abs(wrong - wrong.mean()) < 1.96 * np.asarray(c.band(grid, "bias"), dtype=float))
     # 300 points, of which some eight a curve are independent: 95 % to within 3 % either side, and the tail of
     # reflections that a Cauchy loss lets through takes a little more.
     assert np.mean(inside) > 0.88
@@ -115,8 +102,7 @@ def test_curvature_is_the_integral_of_squared_second_derivatives():
 def test_static_spans_are_left_out():
     r = ranges(6000)
     still = r.time_ns < 10_000_000_000
-    r = replace(r, truth_m=np.where(still, 2.0, r.truth_m))
-    moving = without_static(r)
+    moving = without_static(replace(r, truth_m=np.where(still, 2.0, r.truth_m)))
     assert len(moving) == np.count_nonzero(~still)
     assert moving.excluded == {"static": np.count_nonzero(still)}
     with pytest.raises(UnanswerableError, match="nothing moves"):
@@ -129,8 +115,7 @@ def test_power_that_goes_with_distance_is_warned_of():
     rng = np.random.default_rng(1)
     # Lifted power falls straight with distance: a curve over the one may be an error by the other.
     power = -82 + 10 * np.log10(3.0 - 0.45 * r.truth_m + rng.normal(size=(2, len(r))) * 0.01)
-    straight = ranges(5000, bias=lambda lifted: 0.1 * lifted)
-    found = fit(replace(straight, fpp1_dbm=power[0], fpp2_dbm=power[1]))
+    found = fit(replace(ranges(5000, bias=lambda lifted: 0.1 * lifted), fpp1_dbm=power[0], fpp2_dbm=power[1]))
     assert any("confounded" in warning for warning in found.warnings)
     assert found.calibration.provenance["warnings"] == found.warnings
 

@@ -31,8 +31,7 @@ class Thermostat:
 
 @pytest.fixture(scope="module")
 def warmed():
-    ranges = make(CLEAN["short, 30 s"], 12_001).ranges
-    model = model_of(ranges, FitSettings())
+    model = model_of(make(CLEAN["short, 30 s"], 12_001).ranges, FitSettings())
     warmer = 10 * np.sin(model.ranges.time_ns * 2e-9)
     error = model.ranges.raw_m - model.ranges.truth_m + PER_KELVIN_M * warmer
     pilot = robust_fit(model, error, "cauchy", None, ("delay", *model.curve_kinds()))
@@ -71,8 +70,7 @@ def test_one_more_kind_of_row_is_one_class(warmed):
 
 
 def test_least_squares_with_delays_alone_is_numpys():
-    ranges = make(CLEAN["short, 30 s"], 12_002).ranges
-    model = model_of(ranges, FitSettings(delays_only=True))
+    model = model_of(make(CLEAN["short, 30 s"], 12_002).ranges, FitSettings(delays_only=True))
     error = model.ranges.raw_m - model.ranges.truth_m
     found = robust_fit(model, error, "l2", None, ("delay",))
     weights = [(model.ranges.initiator[:, None] == model.tags) * model.ranges.weight_initiator[:, None],

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 
 import calib
-from calib.errors import BadInputError, UnanswerableError
 from tests.calib.overhearing import bound_ns2, flight, least_squares_ns
-from tests.processes import run
+from tests.processes import succeed
 from tests.shared_data import miluv
 from uwblink import Tag
 from uwblink.importers import read_source
-from uwbsim import simulate
-from uwbsim.scenario.loading import load
+from uwbsim import load, simulate
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 METRES_A_NS = 0.299702547
@@ -72,8 +70,7 @@ def test_intervals_hold_among_reflections_with_a_curve():
     for seed in range(10):
         data, planted = flight(7100 + seed, reflected=0.15, bias_m=0.1)
         delays, std = fitted(data, "receptions")
-        contrast = (delays - planted) - np.mean(delays - planted)
-        errors += contrast.tolist()
+        errors += ((delays - planted) - np.mean(delays - planted)).tolist()
         stated += std.tolist()
     # An interval of a delay holds the constant, too, so contrasts lie within it more often.
     assert np.mean(np.abs(errors) < 1.96 * np.array(stated)) > 0.9
@@ -149,10 +146,10 @@ def test_two_messages_take_the_rate_from_the_carrier():
 @pytest.mark.parametrize(
     ("change", "settings", "error", "said"),
     [
-        ({"overheard": {}}, {}, UnanswerableError, "no listener overheard"),
-        ({}, {"sequential": True}, BadInputError, "sequential"),
-        ({}, {"constants": "pair"}, BadInputError, "constants"),
-        ({}, {"use": "everything"}, BadInputError, "allowed: exchanges, receptions"),
+        ({"overheard": {}}, {}, calib.UnanswerableError, "no listener overheard"),
+        ({}, {"sequential": True}, calib.BadInputError, "sequential"),
+        ({}, {"constants": "pair"}, calib.BadInputError, "constants"),
+        ({}, {"use": "everything"}, calib.BadInputError, "allowed: exchanges, receptions"),
     ],
 )
 def test_what_cannot_be_fitted_is_refused(change, settings, error, said):
@@ -163,9 +160,8 @@ def test_what_cannot_be_fitted_is_refused(change, settings, error, said):
 def test_the_command_says_how_many_were_fitted(tmp_path):
     data, _ = flight(7600, count=400)
     data.save(tmp_path / "f.uwb")
-    done = run("calib", "fit", tmp_path / "f.uwb", "-o", tmp_path / "c.json", "--use", "receptions", "--delays-only")
-    assert done.returncode == 0, done.stderr
-    assert "400 exchanges, 1600 differences of arrival" in done.stdout
+    words = ("calib", "fit", tmp_path / "f.uwb", "-o", tmp_path / "c.json", "--use", "receptions", "--delays-only")
+    assert "400 exchanges, 1600 differences of arrival" in succeed(*words).stdout
     assert calib.load_calibration(tmp_path / "c.json").provenance["settings"]["use"] == "receptions"
 
 
@@ -177,8 +173,7 @@ def test_a_real_flight_has_narrower_intervals_and_the_same_delays(tmp_path):
     # 317 ranges, and some 700 differences of arrival at the five other tags.
     assert (narrow < 0.85 * std).all()
     # What the receptions add is independent, so the change has the difference of both variances (Hausman 1978).
-    change = (heard - delays) / np.sqrt(std**2 - narrow**2)
-    assert np.abs(change).max() < 3
+    assert np.abs((heard - delays) / np.sqrt(std**2 - narrow**2)).max() < 3
     # The doctor says what contradicts: two tags of one robot, a lever arm apart, hear each other's frames too early.
     said = [w for w in found[1].warnings if "overheard" in w]
     assert all(w.startswith(("path 10-11", "path 20-21", "path 30-31")) for w in said), said
@@ -187,5 +182,4 @@ def test_a_real_flight_has_narrower_intervals_and_the_same_delays(tmp_path):
 @pytest.mark.slow
 def test_a_report_fits_receptions_as_well(tmp_path):
     data, _ = flight(7700, count=600)
-    campaign = calib.run_campaign(data, use="receptions")
-    assert campaign.calibration.provenance["arrivals"] > 1900
+    assert calib.run_campaign(data, use="receptions").calibration.provenance["arrivals"] > 1900

@@ -36,8 +36,7 @@ def test_a_search_ends_at_least_squares_and_finds_the_weight_of_its_prior(most, 
     for module in (rows, unknowns):
         monkeypatch.setattr(module, "MOST_DENSE", most)
     rng = np.random.default_rng(1)
-    walk = np.cumsum(rng.normal(0, 0.5, 200))
-    seen = walk + rng.normal(0, 0.1, 200)
+    seen = np.cumsum(rng.normal(0, 0.5, 200)) + rng.normal(0, 0.1, 200)
     steps = sparse.csr_matrix(np.eye(199, 200, 1) - np.eye(199, 200))
     prior = Prior(weight=1.0, structure=sparse.csc_matrix(steps.T @ steps), rows=199, bounds=(1e-3, 1e3))
     layout = Layout((Unknown(kind="path", names=("",) * 200, start=np.zeros(200), priors=(prior,)),))

@@ -15,8 +15,7 @@ from calib.evaluation.models import FilterRanges
 from calib.evaluation.tracking import problems, run_filters
 from tests import processes
 from tests.calib.synthetic import calibration
-from uwbsim import simulate
-from uwbsim.scenario.model import Scenario
+from uwbsim import Scenario, simulate
 
 ANCHORS = [(-4.0, -3.5, 0.3), (4.0, -3.5, 2.8), (4.0, 3.5, 0.4), (-4.0, 3.5, 2.9), (0.0, -3.5, 2.6), (4.0, 0.0, 0.2),
            (0.0, 3.5, 2.4), (-4.0, 0.0, 0.5)]  # fmt: skip
@@ -61,15 +60,15 @@ def known():
 
 @pytest.fixture(scope="module")
 def heard():
-    return [flight(seed, 20.0) for seed in (3101, 3102, 3103)]
+    return flight(3101, 20.0)
 
 
 PLANTED = calibration(DELAYS_NS, 0.005)
 
 
 def test_one_row_is_that_of_a_page_of_numpy(known, heard):
-    x, h, row = heard[0].exchanges, heard[0].overheard, 1234
-    ranges = calib.load_ranges(heard[0])
+    x, h, row = heard.exchanges, heard.overheard, 1234
+    ranges = calib.load_ranges(heard)
     found = known.correct_arrivals(ranges)
     own = {name: int(column[row]) for name, column in h.items() if column.dtype.kind == "i"}
     at = int(np.flatnonzero((x.tx1 == own["tx1_n"]) & (x.initiator == own["initiator"]))[0])
@@ -121,12 +120,11 @@ def test_without_noise_it_is_the_true_difference_and_the_robot_is_where_it_is():
 
 @pytest.mark.slow
 def test_a_robot_that_never_sends_is_localized(known, heard):
-    found = [one for each in heard for one in calib.localize(each, known, LISTEN)]
+    flights = (heard, flight(3102, 20.0), flight(3103, 20.0))
+    found = [one for each in flights for one in calib.localize(each, known, LISTEN)]
     total = summarize(found)
     assert [one.body for one in found] == ["robot"] * 3
-    assert total.rmse_m["raw"] > 0.09
-    assert total.rmse_m["variance"] < 0.045
-    assert total.rmse_m["robust"] < 0.045
+    assert max(total.rmse_m["variance"], total.rmse_m["robust"]) < 0.045 < 0.09 < total.rmse_m["raw"]
     # 95 % of a chi-square over its degrees: three a value, over as many values as are independent.
     assert total.nees_bounds[0] < total.nees < total.nees_bounds[1]
     assert total.nees_bounds[1] - total.nees_bounds[0] < 1.0
@@ -137,7 +135,7 @@ def test_a_robot_that_never_sends_is_localized(known, heard):
 
 @pytest.mark.slow
 def test_the_filter_knows_what_listeners_of_an_exchange_share(heard):
-    (problem,), rng = problems(load_flight(heard[0])), np.random.default_rng(5)
+    (problem,), rng = problems(load_flight(heard)), np.random.default_rng(5)
     true_m = problem.ranges.arrivals.truth_m[problem.rows - len(problem.ranges)]
     drawn = 0.3 * rng.normal(size=len(problem.ranges))[problem.exchange] + 0.05 * rng.normal(size=len(true_m))
     own, common = np.full(len(true_m), 0.05), np.full(len(true_m), 0.3)
@@ -152,7 +150,7 @@ def test_the_filter_knows_what_listeners_of_an_exchange_share(heard):
 
 
 def test_constants_of_both_pairs_in_a_difference_are_followed(heard):
-    (problem,), rng = problems(load_flight(heard[0])), np.random.default_rng(6)
+    (problem,), rng = problems(load_flight(heard)), np.random.default_rng(6)
     true_m, zero = problem.ranges.arrivals.truth_m[problem.rows - len(problem.ranges)], np.zeros(len(problem))
     offsets_m = np.sum(problem.sign * rng.normal(0, 0.1, problem.pair.max() + 1)[problem.pair], axis=1)
     one = FilterRanges(true_m + offsets_m + rng.normal(0, 0.05, len(zero)), zero + 0.05, zero, 0 * problem.sign)
@@ -193,8 +191,7 @@ def test_what_is_overheard_helps_a_robot_that_ranges(known):
 @pytest.mark.slow
 def test_a_robot_on_board_is_helped_by_what_is_overheard(known, tmp_path):
     """Its own tags, those that hear it and those that it hears, and one of its tags the exchanges of the other."""
-    all_hear = flight(3121, 5.0, pairs="between-bodies", passive=DELAYS_NS)
-    all_hear.save(tmp_path / "robot.uwb")
+    flight(3121, 5.0, pairs="between-bodies", passive=DELAYS_NS).save(tmp_path / "robot.uwb")
     known.save(tmp_path / "c.json")
     found = []
     for use in ("exchanges", "receptions"):
@@ -225,7 +222,7 @@ def test_reflections_that_last_and_pass_the_gate_are_counted():
 
 
 def test_delays_that_are_known_in_sums_only_correct_no_difference(heard):
-    ranges, split = calib.load_ranges(heard[0]), (((1, 2, 3, 4), (5, 6, 7, 8)),)
+    ranges, split = calib.load_ranges(heard), (((1, 2, 3, 4), (5, 6, 7, 8)),)
     with pytest.raises(calib.BadInputError, match="tags 1, 2, 3"):
         replace(PLANTED, undetermined_splits=split).correct_arrivals(ranges)
     without = {tag: delay for tag, delay in DELAYS_NS.items() if tag not in ROBOT}

@@ -71,11 +71,9 @@ def test_a_body_that_ranges_only_where_its_place_is_unknown_is_left_out(flights)
     bodies = sorted({tag.body for tag in flight.tags})
     last = flights["test1"].ranges.time_ns.max()
     # One body's poses come after all ranges.
-    late = flight.poses.body == bodies[0]
-    time = np.where(late, flight.poses.time_ns + last, flight.poses.time_ns)
+    time = np.where(flight.poses.body == bodies[0], flight.poses.time_ns + last, flight.poses.time_ns)
     poses = replace(flight.poses, time_ns=time)[np.argsort(time, kind="stable")]
-    found = localize(replace(flight, poses=poses), known, Settings(seeds=1))
-    assert {one.body for one in found} == set(bodies[1:])
+    assert {one.body for one in localize(replace(flight, poses=poses), known, Settings(seeds=1))} == set(bodies[1:])
 
 
 @pytest.mark.slow

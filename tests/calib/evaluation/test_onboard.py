@@ -16,9 +16,8 @@ from calib.evaluation.localization import write_tum
 from calib.evaluation.onboard import onboard_json, onboard_text
 from tests.calib import synthetic
 from tests.shared_data import miluv, shared
-from uwblink import Contents, Exchanges, Poses, Tag
+from uwblink import Contents, Exchanges, Poses, Tag, raw_range
 from uwblink.importers import read_source
-from uwblink.twr import raw_range
 
 ANCHORS = np.array([[3, 3, 0.3], [-3, 3, 2.2], [-3, -3, 0.4], [3, -3, 2.4], [0, 3.5, 1.2], [3.5, 0, 1.4]])
 ARMS = {10: (0.15, -0.15, -0.05), 11: (-0.15, 0.15, -0.05)}
@@ -231,8 +230,7 @@ def with_patterns(found, size_m):
     t = (x.time_ns - 10**12) * 1e-9
     drone = np.where(np.isin(x.initiator, [10, 11]), x.initiator, x.target)
     anchor = x.initiator + x.target - drone
-    antenna = place(t) + attitude(t).apply(np.array([ARMS[k] for k in drone.tolist()]))
-    away = ANCHORS[anchor] - antenna
+    away = ANCHORS[anchor] - (place(t) + attitude(t).apply(np.array([ARMS[k] for k in drone.tolist()])))
     away /= np.linalg.norm(away, axis=1)[:, None]
     longer = size_m * attitude(t).inv().apply(away)[:, 0]
     longer += np.where(anchor == 2, size_m * turned.inv().apply(-away)[:, 0], 0.0)
@@ -255,8 +253,7 @@ def test_patterns_are_corrected_by_the_estimated_pose():
     assert errors[1] < 1.2 * errors[0]
     assert errors[1] < 0.5 * errors[2]
     # Poses of the body serve as truth alone: without them the estimate is the same.
-    some = turned.poses[turned.poses.body != "drone"]
-    (alone,) = localize_onboard(replace(turned, poses=some), known)
+    (alone,) = localize_onboard(replace(turned, poses=turned.poses[turned.poses.body != "drone"]), known)
     np.testing.assert_array_equal(alone.estimate_m, corrected.estimate_m)
 
 
@@ -333,8 +330,7 @@ def test_multilateration_is_exact_and_leaves_a_reflection_out():
     reflected[[2, 9]] += 3.0, 0.8
     assert np.linalg.norm(multilaterate(reflected, twice, 0.0).place_m - true) < 0.15
     # Three anchors leave two mirrored places, between which a height decides.
-    low = multilaterate(exact[:3], ANCHORS[:3] * [1, 1, 0] + [0, 0, 1.0], 0.0, 1.9)
-    assert low.place_m[2] > 1.0
+    assert multilaterate(exact[:3], ANCHORS[:3] * [1, 1, 0] + [0, 0, 1.0], 0.0, 1.9).place_m[2] > 1.0
 
 
 @pytest.mark.slow

@@ -156,8 +156,7 @@ def smoothed(ranges, known, anchors_m, moves_m, std_m):
             after.append((running.state[0].copy(), running.covariance[0].copy()))
         latest, found = found, np.array([state for state, _ in after])
         for k in range(len(found) - 2, -1, -1):
-            gain = np.linalg.solve(before[k + 1][1], after[k][1]).T
-            found[k] += gain @ (found[k + 1] - before[k + 1][0])
+            found[k] += np.linalg.solve(before[k + 1][1], after[k][1]).T @ (found[k + 1] - before[k + 1][0])
     return found, np.sqrt(np.diag(after[-1][1]))
 
 

@@ -10,11 +10,9 @@ import calib
 from calib.data.ranges import Ranges, concatenate
 from calib.evaluation.statistics import evaluate, split_error
 from calib.figures import errors_by_pair
-from calib.fitting.fitting import fit
 from tests import processes
 from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
-from uwblink import Contents
-from uwblink.ticks import SPEED_OF_LIGHT
+from uwblink import SPEED_OF_LIGHT, Contents
 
 
 @pytest.mark.parametrize(("pairs_m", "sessions_m"), [(0.0, 0.0), (0.05, 0.0), (0.05, 0.04)])
@@ -51,7 +49,7 @@ def test_the_planted_calibration_is_found_beside():
     planted: dict[str, object] = {"delays_ns": {str(t): d for t, d in DELAYS_NS.items()}}
     planted["bias_curve"] = {"knots": curve.t.tolist(), "coefficients": curve.c.tolist(), "degree": 3}
     r = replace(ranges(), planted=planted)
-    calibration = fit(r).calibration
+    calibration = calib.fit(r).calibration
     found = evaluate(r, calibration).planted
     assert sum(found.delay_error_ns.values()) == pytest.approx(0, abs=1e-12)
     # A delay and a constant of the curve exchanged change nothing here.
@@ -80,7 +78,7 @@ def test_the_planted_calibration_is_found_beside():
 
 def test_an_evaluation_prints_on_a_screen():
     r = ranges(2000)
-    found = evaluate(r, fit(r).calibration)
+    found = evaluate(r, calib.fit(r).calibration)
     lines = repr(found).splitlines()
     assert max(map(len, lines[1:])) <= 80, "a terminal has room for every figure"
     cells, full = lines[-1].split(), found.overall.full
@@ -92,7 +90,7 @@ def test_an_evaluation_prints_on_a_screen():
 
 def test_a_figure_has_the_errors_of_each_pair_and_of_many_pairs_the_farthest():
     r = ranges(2000)
-    found = evaluate(r, fit(r).calibration)
+    found = evaluate(r, calib.fit(r).calibration)
     axes = errors_by_pair(7.0, found).axes[0]
     assert [text.get_text() for text in axes.get_xticklabels()] == list(found.pairs)
     for (line, _, (bars,)), stage in zip(axes.containers, ("raw", "full"), strict=True):

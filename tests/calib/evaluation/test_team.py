@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 import calib
 import uwbsim
-from calib import BadInputError, TeamSettings, UnanswerableError, localize_team
 from calib.calibration.patterns import Pattern
 from calib.data.samples import stamped
 from calib.errors import WeakHeadingWarning
@@ -34,9 +33,8 @@ EXACT = ProcessNoise(force=1e-9, gyro=1e-9, force_bias=0.0, gyro_bias=0.0, force
 
 def place(robot, t):
     """Where a robot is: each on its own sum of sines, three metres from the others."""
-    centre = np.array([[0.0, 0.0, 1.0], [3.0, 0.5, 1.6], [1.2, 2.8, 0.7]])[robot]
     way = [np.sin(0.9 * t + robot), np.cos((0.7 + 0.1 * robot) * t), 0.5 * np.sin(1.1 * t + 2 * robot)]
-    return centre + 0.7 * np.stack(way, axis=-1)
+    return np.array([[0.0, 0.0, 1.0], [3.0, 0.5, 1.6], [1.2, 2.8, 0.7]])[robot] + 0.7 * np.stack(way, axis=-1)
 
 
 def attitude(robot, t):
@@ -100,13 +98,13 @@ def flight(seconds=4.0, seed=1, bias=1.0, **changes):
 
 
 PLANTED = calibration(dict.fromkeys(ARMS, 0.0), NOISE_M)
-CLOSE = TeamSettings(noise=EXACT, start_std_m=0.02, start_std_deg=0.5, start_std_m_s=0.02, gate=1e9)
+CLOSE = calib.TeamSettings(noise=EXACT, start_std_m=0.02, start_std_deg=0.5, start_std_m_s=0.02, gate=1e9)
 
 
 def test_without_errors_dead_reckoning_is_the_relative_motion():
     still = replace(EXACT, force_start=1e-6, gyro_start=1e-6)
     exact = replace(CLOSE, noise=still, start_std_m=1e-6, start_std_deg=1e-5, start_std_m_s=1e-6)
-    found = localize_team(flight(bias=0.0), PLANTED, exact)
+    found = calib.localize_team(flight(bias=0.0), PLANTED, exact)
     assert [(one.body, one.reference) for one in found] == [("b", "a"), ("c", "a")]
     for robot, one in enumerate(found, 1):
         track = one.tracks["dead reckoning"]
@@ -116,7 +114,7 @@ def test_without_errors_dead_reckoning_is_the_relative_motion():
         assert (Rotation.from_quat(track.attitude).inv() * turned).magnitude().max() < 5e-4
         np.testing.assert_allclose(track.truth_m, where, atol=1e-4)
     # Another frame: poses of a in that of c are the inverses.
-    back = {one.body: one for one in localize_team(flight(bias=0.0), PLANTED, replace(exact, reference="c"))}
+    back = {one.body: one for one in calib.localize_team(flight(bias=0.0), PLANTED, replace(exact, reference="c"))}
     here, there = back["a"].tracks["dead reckoning"], found[1].tracks["dead reckoning"]
     undone = -Rotation.from_quat(there.attitude).inv().apply(there.estimate_m)
     assert np.abs(here.estimate_m - undone).max() < 0.03
@@ -160,8 +158,7 @@ def batch(contents, t, ends, measured, start):
                 break
             for robot in range(3):
                 w, f = ((read[robot, k] + read[robot, k + 1]) / 2 - off[:, robot]).reshape(count, 2, 3).swapaxes(0, 1)
-                half = turn[robot] * Rotation.from_rotvec(w * h / 2)
-                force = half.apply(f)
+                force = (turn[robot] * Rotation.from_rotvec(w * h / 2)).apply(f)
                 place_m[robot] += speed[robot] * h + force * h**2 / 2
                 speed[robot] += force * h
                 turn[robot] = turn[robot] * Rotation.from_rotvec(w * h)
@@ -190,7 +187,7 @@ def batch(contents, t, ends, measured, start):
 def test_at_the_end_it_is_a_batch_of_least_squares_in_a_world(seed):
     contents = flight(4.0, seed)
     t, ends, measured = ranging(4.0, seed)
-    found = localize_team(contents, PLANTED, CLOSE)
+    found = calib.localize_team(contents, PLANTED, CLOSE)
     tracks = [one.tracks["variance"] for one in found]
     # Both begin at the same noisy poses and velocities, those of dead reckoning.
     start: list[Any] = [None]
@@ -221,24 +218,19 @@ def known():
     return calib.fit(simulated(300, 60.0), use="receptions").calibration
 
 
-LISTEN = TeamSettings(use="receptions", noise=IMUS["industrial"])
-
-
-@pytest.fixture(scope="module")
-def heard(known):
-    """Three flights of the paper's setting, with seeds chosen before looking."""
-    return [one for seed in (301, 302, 303) for one in localize_team(simulated(seed, 12.0), known, LISTEN)]
+LISTEN = calib.TeamSettings(use="receptions", noise=IMUS["industrial"])
 
 
 @pytest.mark.slow
-def test_three_quadcopters_know_where_the_others_are_and_how_well(heard):
+def test_three_quadcopters_know_where_the_others_are_and_how_well(known):
+    """Three flights of the paper's setting, with seeds chosen before looking."""
+    heard = [one for seed in (301, 302, 303) for one in calib.localize_team(simulated(seed, 12.0), known, LISTEN)]
     assert [(one.body, one.reference) for one in heard] == 3 * [("robot2", "robot1"), ("robot3", "robot1")]
     found = team_json(heard)
     figures, less = found["summary"], found["reduction_by_listening"]
-    assert figures["dead reckoning"]["rmse_m"] > 20 * figures["variance"]["rmse_m"]
-    assert figures["raw"]["rmse_m"] > 2 * figures["variance"]["rmse_m"]
+    rmse_m = {name: one["rmse_m"] for name, one in figures.items()}
     # Ranges have 5 cm of noise, and baselines of half a metre see directions over three metres.
-    assert figures["variance"]["rmse_m"] < 0.2
+    assert rmse_m["variance"] < min(0.2, rmse_m["raw"] / 2, rmse_m["dead reckoning"] / 20)
     assert figures["variance"]["attitude_rmse_deg"] < 1.5
     for name in ("calibrated", "variance", "robust"):
         # The paper has 48 % at best, in other flights.
@@ -260,7 +252,7 @@ def test_poses_after_the_start_only_judge(known):
     off = np.array([5.0, -3.0, 1.0]) * (whole.poses.body == "robot2")[:, None] * (whole.poses.time_ns > 3e8)[:, None]
     elsewhere = replace(whole, poses=replace(whole.poses, position_m=whole.poses.position_m + off))
     first = replace(whole, poses=whole.poses[np.flatnonzero(whole.poses.time_ns < 3e8)])
-    found = [localize_team(one, known, LISTEN) for one in (whole, elsewhere, first)]
+    found = [calib.localize_team(one, known, LISTEN) for one in (whole, elsewhere, first)]
     for body in range(2):
         tracks = [one[body].tracks["robust"] for one in found]
         np.testing.assert_array_equal(tracks[0].estimate_m, tracks[2].estimate_m)
@@ -287,7 +279,7 @@ def test_the_filter_knows_what_listeners_of_an_exchange_share(known, monkeypatch
 
     monkeypatch.setattr(team, "filter_ranges", drawn)
     ungated, flights = replace(LISTEN, gate=1e9), [simulated(seed, 6.0) for seed in seeds]
-    figures = team_json([one for each in flights for one in localize_team(each, known, ungated)])["summary"]
+    figures = team_json([one for each in flights for one in calib.localize_team(each, known, ungated)])["summary"]
     assert 4.5 < figures["variance"]["nees"] < 7
     assert figures["raw"]["nees"] > 1.3 * figures["variance"]["nees"]
 
@@ -307,11 +299,12 @@ def test_patterns_are_corrected_by_the_estimated_poses():
     found = [
         one.tracks["calibrated"].rmse_m
         for data, by in ((plain, PLANTED), (replace(plain, exchanges=exchanges), known))
-        for one in localize_team(data, by, CLOSE)
+        for one in calib.localize_team(data, by, CLOSE)
     ]
     assert max(found[2:]) < 1.3 * max(found[:2])
     without = [
-        one.tracks["calibrated"].rmse_m for one in localize_team(replace(plain, exchanges=exchanges), PLANTED, CLOSE)
+        one.tracks["calibrated"].rmse_m
+        for one in calib.localize_team(replace(plain, exchanges=exchanges), PLANTED, CLOSE)
     ]
     assert max(without) > 2 * max(found[2:])
 
@@ -323,41 +316,46 @@ def kept(imu, rows):
 @pytest.mark.parametrize(
     ("change", "settings", "error", "said"),
     [
-        (lambda _: {"imu": {}}, {}, UnanswerableError, r"memory: inertial readings of 0 bodies with tags \(none\)"),
+        (
+            lambda _: {"imu": {}},
+            {},
+            calib.UnanswerableError,
+            r"memory: inertial readings of 0 bodies with tags \(none\)",
+        ),
         (
             lambda flown: kept(flown.imu, lambda imu: imu["body"] == "a"),
             {},
-            UnanswerableError,
+            calib.UnanswerableError,
             r"of 1 bodies with tags \(a\), .* two or more",
         ),
         (
             lambda flown: kept(flown.imu, lambda imu: (imu["body"] != "b") | (imu["time_ns"] < NS + 10**9)),
             {},
-            UnanswerableError,
+            calib.UnanswerableError,
             r"inertial readings of b cover -0.1 to 1.0 s .* to 2.0 s",
         ),
         (
             lambda flown: {"poses": flown.poses[np.flatnonzero(flown.poses.body != "c")]},
             {},
-            UnanswerableError,
+            calib.UnanswerableError,
             "no poses of c",
         ),
-        (lambda _: {}, {"use": "receptions"}, UnanswerableError, "no listener overheard"),
-        (lambda _: {}, {"reference": "d"}, BadInputError, "`reference`: found 'd', memory has a, b, c"),
-        (lambda _: {}, {"start_std_deg": -1.0}, BadInputError, "`start_std_deg`"),
+        (lambda _: {}, {"use": "receptions"}, calib.UnanswerableError, "no listener overheard"),
+        (lambda _: {}, {"reference": "d"}, calib.BadInputError, "`reference`: found 'd', memory has a, b, c"),
+        (lambda _: {}, {"start_std_deg": -1.0}, calib.BadInputError, "`start_std_deg`"),
     ],
 )
 def test_missing_sensors_are_named(change, settings, error, said):
     contents = flight(2.0)
     with pytest.raises(error, match=said):
-        localize_team(replace(contents, **change(contents)), PLANTED, replace(CLOSE, **settings))
+        calib.localize_team(replace(contents, **change(contents)), PLANTED, replace(CLOSE, **settings))
 
 
 def test_a_body_with_one_tag_is_named():
     contents = flight(2.0)
     two = (contents.exchanges.initiator != 6) & (contents.exchanges.target != 6)
-    with pytest.warns(WeakHeadingWarning, match="memory: c has only one tag"):
-        found = localize_team(replace(contents, exchanges=contents.exchanges[two]), PLANTED, CLOSE)
+    with pytest.warns(WeakHeadingWarning, match="memory: c has one tag that ranges"):
+        found = calib.localize_team(replace(contents, exchanges=contents.exchanges[two]), PLANTED, CLOSE)
     assert found[1].tracks["variance"].rmse_m < 0.2
 
 
@@ -379,8 +377,8 @@ def test_an_option_of_another_model_is_refused(option, used_by, tmp_path):
 
 
 def test_the_command_prints_writes_and_refuses(known, tmp_path):
-    recording, document = tmp_path / "three.uwb", tmp_path / "c.json"
-    simulated(307, 1.0).save(recording)
+    recording, document, flown = tmp_path / "three.uwb", tmp_path / "c.json", simulated(307, 1.0)
+    flown.save(recording)
     known.save(document)
     words = "calib", "localize", recording, "-c", document, "--model", "team"
     said = json.loads(processes.run(*words, "--use", "receptions", "--imu", "industrial", "--json").stdout)
@@ -396,9 +394,8 @@ def test_the_command_prints_writes_and_refuses(known, tmp_path):
     close = np.loadtxt(tmp_path / "tum" / "three_uwb-robot3-from-robot1-variance.tum")
     assert np.abs(truth[:, 1:4] - close[:, 1:4]).max() < 0.3
     assert np.abs(np.sum(truth[:, 4:] * close[:, 4:], axis=1)).min() > np.cos(np.radians(5) / 2)
-    bare = tmp_path / "bare.uwb"
-    replace(simulated(307, 1.0), imu={}).save(bare)
-    assert "bare.uwb" in processes.refuse(*words[:2], bare, *words[3:], status=1, naming=["imu"])
+    replace(flown, imu={}).save(tmp_path / "bare.uwb")
+    processes.refuse(*words[:2], tmp_path / "bare.uwb", *words[3:], status=1, naming=["bare.uwb", "imu"])
     processes.refuse(*words, "--imu", "wooden", naming=["industrial"])
     processes.refuse(*words, "--start-std", "0", "1", "1", naming=["--start-std:"])
 
@@ -406,7 +403,7 @@ def test_the_command_prints_writes_and_refuses(known, tmp_path):
 def test_delays_that_a_calibration_has_wrong_within_its_errors_are_corrected_on_the_way():
     off = dict(zip(ARMS, [0.4, -0.3, 0.5, 0.3, -0.4, 0.3], strict=True))
     known = replace(PLANTED, delays_ns=off, delays_std_ns=dict.fromkeys(ARMS, 0.4))
-    for found in localize_team(flight(6.0), known, replace(CLOSE, online=True)):
+    for found in calib.localize_team(flight(6.0), known, replace(CLOSE, online=True)):
         assert found.rmse_m["online"].mean() < 0.7 * found.rmse_m["variance"].mean()
         wrong = np.array([delay / std for delay, std in found.delays.values()])
         assert np.abs(wrong).max() < 3.5

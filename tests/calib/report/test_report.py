@@ -142,8 +142,7 @@ def test_tests_take_several_files():
 
 
 def test_planted_delays_stand_beside_fitted_ones(campaign):
-    tables = page_of_numpy.Tables((campaign / "r.html").read_text())
-    header, *rows = tables.having("planted, same gauge (ns)")
+    header, *rows = page_of_numpy.Tables((campaign / "r.html").read_text()).having("planted, same gauge (ns)")
     with Recording.open(campaign / "train.uwb") as recording:
         planted = recording.meta()["planted"]["delays_ns"]
     number = page_of_numpy.number

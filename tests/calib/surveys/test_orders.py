@@ -8,7 +8,6 @@ import pytest
 import calib
 from benchmarks.standing import standing_boards
 from benchmarks.surveys import orders_of
-from calib.errors import BadInputError
 from calib.surveys.solution import exchanged_boards, is_in_order
 
 pytestmark = pytest.mark.slow
@@ -65,5 +64,5 @@ def test_an_exchange_that_is_another_one_from_the_other_end_names_both():
 
 @pytest.mark.parametrize("orders", [{"1": (1, 2, 9)}, {"1": (1, 2, 2)}, {"Z": (1, 2)}])
 def test_orders_of_boards_that_are_not_there_are_refused(orders):
-    with pytest.raises(BadInputError, match=r"order of boards|an arrangement"):
+    with pytest.raises(calib.BadInputError, match=r"order of boards|an arrangement"):
         calib.survey(FIVE.ranges, known=calib.Knowledge(shape="line", orders=orders))

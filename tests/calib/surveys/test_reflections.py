@@ -9,7 +9,6 @@ from scipy.special import betaln, ndtr
 
 import calib
 from benchmarks.standing import standing_boards
-from calib.surveys.knowledge import Knowledge
 from calib.surveys.network import Case
 from calib.surveys.recordings import read_surveys
 from calib.surveys.reflections import Marks
@@ -25,7 +24,7 @@ PAIR_M, CURVE_M = 0.02, 0.03
 def linear():
     """Marks of three arrangements on a line, none set, and how unlikely marks are by the likelihood written out."""
     world = standing_boards(11, boards=4, arrangements=3, reflected=0.12)
-    knowledge = Knowledge(shape="line")
+    knowledge = calib.Knowledge(shape="line")
     network = network_of(read_surveys(world.ranges, knowledge), knowledge, {}, curve=False)
     x, free = first_start(network), network.layout.free()
     rows = len(network.means.range_m)
@@ -72,8 +71,7 @@ def reflected(world, arrangement, first, second, longer_m):
     """Ranges of a world in which one pair of an arrangement is longer."""
     r = world.ranges
     there = (r.time_ns >= 70e9 * arrangement) & (r.time_ns < 70e9 * (arrangement + 1) - 5e9)
-    ends = np.sort(np.column_stack([r.initiator, r.target]), axis=1)
-    hit = there & (ends == sorted([first, second])).all(axis=1)
+    hit = there & (np.sort(np.column_stack([r.initiator, r.target]), axis=1) == sorted([first, second])).all(axis=1)
     assert hit.sum() == 60
     return longer_m * hit
 
@@ -112,9 +110,8 @@ def test_what_cannot_be_told_is_said_and_widens():
     longer = reflected(world, 1, 1, 2, 0.4)
     result = calib.survey(replace(world.ranges, raw_m=world.ranges.raw_m + longer), known="line")
     # Of three boards on a line, any of the three ranges may be the wrong one, longer or too short.
-    who = [(one.first, one.second) for one in result.reflected if one.arrangement == "2"]
-    assert len(who) > 1
-    assert any(text.startswith("may also be reflected: ") for text in result.warnings)
+    assert len([(one.first, one.second) for one in result.reflected if one.arrangement == "2"]) > 1
+    assert any(text.startswith("may be reflected, too: ") for text in result.warnings)
     clean = calib.survey(world.ranges, known="line").calibration
     for tag, delay in result.calibration.delays_ns.items():
         assert abs(delay - world.delays_ns[tag]) < 3 * result.calibration.delays_std_ns[tag]

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwblink import Exchanges
-from uwblink.recording.schema import Poses, Tag
+from uwblink import Exchanges, Poses, Tag
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 
 DELAYS_NS = {1: -0.36, 2: 0.05, 3: 0.24, 4: -0.11, 5: -0.2, 6: 0.1}
@@ -25,8 +24,7 @@ def place(body, t):
     period, phase = rng.uniform(4.0, 11.0, (3, 2)), rng.uniform(0, 2 * np.pi, (3, 2))
     middle = [2.2 * np.cos(2.1 * body), 2.2 * np.sin(2.1 * body), 1.2 + 0.2 * body]
     size = np.array([0.8, 0.8, 0.5])
-    wave = np.sin(2 * np.pi * t[:, None, None] / period + phase).sum(axis=2)
-    return middle + 0.6 * size * wave
+    return middle + 0.6 * size * np.sin(2 * np.pi * t[:, None, None] / period + phase).sum(axis=2)
 
 
 def since_takeoff(t, standing_s):
@@ -141,8 +139,7 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
 
     distance = np.linalg.norm(antenna(pair[:, 0], t) - antenna(pair[:, 1], t), axis=1)
     fpp = -79 - 20 * np.log10(distance / 2) + rng.normal(0, 3, (2, n))
-    lifted = np.mean(10 ** ((fpp + 82) / 10), axis=0)
-    error = curve(lifted) - curve(1.0) + noise_m * rng.normal(size=n)
+    error = curve(np.mean(10 ** ((fpp + 82) / 10), axis=0)) - curve(1.0) + noise_m * rng.normal(size=n)
     error += np.where(rng.random(n) < reflected, rng.exponential(0.3, n), 0)
     if blocked:
         both = np.sort((pair - 1) // 2 if blocked == "bodies" else pair, axis=1)

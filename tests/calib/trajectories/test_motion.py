@@ -18,8 +18,7 @@ def readings(flown):
     time_s = np.arange(0.0, 4.0, 0.01)
     wave = np.sin(5 * time_s)
     columns = {f"w{axis}": 0.1 * wave for axis in "xyz"} | {"ax": wave, "ay": 0.5 * wave, "az": 9.81 + 0 * wave}
-    names = np.full(len(time_s), "robot0")
-    return {"time_ns": np.rint(time_s * 1e9).astype(np.int64), "body": names, **columns}
+    return {"time_ns": np.rint(time_s * 1e9).astype(np.int64), "body": np.full(len(time_s), "robot0"), **columns}
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +33,7 @@ def laid_out():
     scene = scene_from(flown, FlightSettings(poses_until_s=1.0, anchors="sought", distances=tapes))
     motion = Motion.of(scene)
     layout = Layout(motion.unknowns({}, 8.0))
-    rng = np.random.default_rng(2)
-    x = 3 * rng.normal(size=layout.size)
+    x = 3 * np.random.default_rng(2).normal(size=layout.size)
     # Turns are linear to first order only: at 1e-4 rad to a ten-thousandth of a lever arm.
     x[layout.where["turn"]] *= 1e-4
     return scene, motion, layout, x
@@ -57,8 +55,7 @@ def test_distances_and_rows_have_the_derivatives_of_finite_differences(laid_out)
     step = np.random.default_rng(3).normal(size=layout.size)
     ahead, behind = x + 1e-6 * step, x - 1e-6 * step
     moved = geometry.derivatives(x, np.arange(len(scene.time_s))) @ step
-    numeric = (geometry.distances(ahead)[0] - geometry.distances(behind)[0]) / 2e-6
-    assert np.allclose(moved, numeric, atol=1e-3)
+    assert np.allclose(moved, (geometry.distances(ahead)[0] - geometry.distances(behind)[0]) / 2e-6, atol=1e-3)
     assert rows.keys() == {"place", "force robot0", "height", "tape"}
     for kind in rows.values():
         value = [sum(terms.value for terms in kind.terms(at)) for at in (ahead, behind)]

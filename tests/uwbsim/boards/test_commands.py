@@ -4,6 +4,7 @@ import math
 import random
 import struct
 import time
+from contextlib import closing
 from itertools import pairwise
 
 import numpy as np
@@ -16,7 +17,6 @@ from uwblink.errors import RefusedError
 from uwblink.importers.poses import read_poses
 from uwblink.wire import messages as m
 from uwblink.wire.fields import INT, PRINTED, TEXT
-from uwbsim import UwbsimError, VirtualPorts
 from uwbsim.boards.commands import EXECUTORS, atoi, printed_float, read_commands, register_command
 from uwbsim.boards.frames import NS_PER_MS
 from uwbsim.boards.server import LivePoses, Server, stays_s
@@ -52,7 +52,7 @@ def voltage():
 
 def test_a_new_command_is_one_message_class_and_one_executor(voltage):
     register_command(GetVoltage, lambda board, factor, name: Voltage(board.id, 3.25 * factor, name.decode()))
-    ports = VirtualPorts(bench_scenario())
+    ports = uwbsim.VirtualPorts(bench_scenario())
     assert Board(ports.port(2)).request(GetVoltage(2, "core")) == Voltage(2, 6.5, "core")
     assert Board(ports.port(1)).request(m.GetId()) == m.IdReport(1)
     assert ports.transfers.maxlen == 20_000, "what boards sent long ago is not kept"
@@ -68,7 +68,7 @@ def test_an_executor_may_take_its_time_and_may_fail(voltage):
         return True
 
     register_command(GetVoltage, slowly)
-    board = Board(VirtualPorts(bench_scenario()).port(1))
+    board = Board(uwbsim.VirtualPorts(bench_scenario()).port(1))
     tries: list[int] = []
     assert board.request(GetVoltage(2, "slow")) == Voltage(1, 1.0, "slow")
     # Tried at the polls of the USB buffer, one each millisecond.
@@ -78,11 +78,11 @@ def test_an_executor_may_take_its_time_and_may_fail(voltage):
 
 
 def test_commands_and_fields_that_boards_cannot_read_are_refused(monkeypatch):
-    with pytest.raises(UwbsimError, match="GetVoltage: not a registered command of uwblink"):
+    with pytest.raises(uwbsim.UwbsimError, match="GetVoltage: not a command that uwblink knows"):
         register_command(GetVoltage, lambda board: m.IdleSet())
     monkeypatch.setitem(m.COMMANDS, b"R10", Voltage)
     with pytest.raises(
-        UwbsimError, match=r"Voltage\.volts: boards cannot read printed number from the host; they read"
+        uwbsim.UwbsimError, match=r"Voltage\.volts: boards read no printed number from the host; they read"
     ):
         register_command(Voltage, lambda board: m.IdleSet())
 
@@ -125,7 +125,7 @@ def test_what_boards_take_otherwise_than_the_firmware_is_what_the_page_says(data
 
 @pytest.mark.parametrize("text", ["a\0b", "a|b", "a\rb"])
 def test_the_driver_writes_no_text_that_boards_read_otherwise(text):
-    ports = VirtualPorts(bench_scenario())
+    ports = uwbsim.VirtualPorts(bench_scenario())
     with pytest.raises(RefusedError, match="text"):
         Board(ports.port(1)).request(m.DoTests(1, text, True, 1.0, b"\0\r|"))
     assert not ports.transfers
@@ -159,7 +159,7 @@ def test_floats_that_are_none_are_printed_as_the_processor_prints_them(value, pr
 
 @pytest.mark.parametrize("raw", [b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", b"\x00\x00\x80\xff", b"\xff\xff\x7f\x7f"])
 def test_a_number_that_is_none_does_not_stop_the_bench(raw):
-    ports = VirtualPorts(bench_scenario())
+    ports = uwbsim.VirtualPorts(bench_scenario())
     ports.bench.boards[1].write(b"C03|1|a|1|" + raw + b"|\x01\x00x\r")
     ports.bench.advance(5 * NS_PER_MS)
     assert ports.transfers[0][2].startswith(b"R03|0|1|a|1|")
@@ -204,7 +204,7 @@ def mangled(rng, data):
 
 def test_no_byte_ends_the_bench_or_another_board():
     rng = random.Random(20261121)
-    ports = VirtualPorts(bench_scenario(), lost_share=0.1)
+    ports = uwbsim.VirtualPorts(bench_scenario(), lost_share=0.1)
     bench, victim = ports.bench, ports.bench.boards[1]
     deaths = answers = 0
     for number in range(COMMANDS):
@@ -236,9 +236,8 @@ EPOCH_NS = 1_700_000_000_000_000_000
 def flight(**mocap):
     """Boards of which one flies."""
     box = {"box_min_m": [-2.0, -2.0, 0.5], "box_max_m": [2.0, 2.0, 2.0]}
-    motion = {"model": "random-flight", "speed_mps": 1.0} | box
     tables = bench_scenario().model_dump(mode="json") | {"mocap": {"rate_hz": 120.0, **mocap}}
-    return uwbsim.load(tables, {"bodies.0.motion": motion})
+    return uwbsim.load(tables, {"bodies.0.motion": {"model": "random-flight", "speed_mps": 1.0} | box})
 
 
 def written(world, path, steps):
@@ -291,13 +290,10 @@ def test_served_poses_go_on_after_the_scenario_s_duration(tmp_path):
 
 def test_a_step_ends_though_poses_take_longer_to_write_than_they_last(tmp_path):
     # A tenth of a second of the boards is 5 us of the wall clock: the next poses are due before these are written.
-    server = Server(flight(rate_hz=0.2), speed=2e4)
-    try:
+    with closing(Server(flight(rate_hz=0.2), speed=2e4)) as server:
         server.write_poses(tmp_path / "p.csv")
         for _ in range(3):
             server.step()
-    finally:
-        server.close()
     assert len((tmp_path / "p.csv").read_text().splitlines()) > 1
 
 
@@ -338,12 +334,9 @@ def test_boards_stand_while_nobody_is_carried():
 
 def test_a_server_says_when_boards_stand():
     told: list[str] = []
-    server = uwbsim.Server(scenario())
-    try:
+    with closing(uwbsim.Server(scenario())) as server:
         server.announce(told.append)
         server.run(lambda: len(told) == 3, 20.0)
-    finally:
-        server.close()
     assert told == [
         "    0 s  place 1 of 3: boards stand until 0.2 s",
         "  0.3 s  place 2 of 3: boards stand until 0.5 s",

@@ -125,8 +125,7 @@ def test_protocols_far_apart_are_drawn_about_their_medians_and_whole_half_ticks_
     # A normal density of 8 half ticks changes by 8 % of its top, at most, over one; a bin with one more by all of it.
     assert np.abs(np.diff(heights)).max() < 0.2 * heights.max()
     # A protocol that is far wider fills the outermost bins, which do not flatten the others.
-    wide = {"ss": np.random.default_rng(2).normal(0.0, 2.0, 20_000), "ds": half * ticks}
-    drawn = histograms(7.16, wide).axes[0]
+    drawn = histograms(7.16, {"ss": np.random.default_rng(2).normal(0.0, 2.0, 20_000), "ds": half * ticks}).axes[0]
     assert drawn.get_ylim()[1] < 8
     # Beyond some 7 cm on either side lie 48.5 % of errors of 2 m.
     assert {text.get_text() for text in drawn.texts} <= {"48 %", "49 %"}
@@ -141,8 +140,7 @@ def test_protocols_far_apart_are_drawn_about_their_medians_and_whole_half_ticks_
 
 def judged(flight):
     """A figure that grows with what is varied, and another that stays."""
-    spread = float(np.std(flight.exchanges.range_m - flight.truth_m))
-    return {"spread_m": spread, "same": 1.0, "word": "none"}
+    return {"spread_m": float(np.std(flight.exchanges.range_m - flight.truth_m)), "same": 1.0, "word": "none"}
 
 
 @pytest.mark.parametrize(
@@ -169,9 +167,8 @@ def test_a_sweep_draws_what_came_out_and_says_what_it_is(tmp_path, kind, more, c
 
 
 def test_bands_over_seeds_reach_from_the_least_to_the_largest():
-    values = [1.0] * 3 + [2.0] * 3
     result = np.array([1.0, 2.0, 9.0, 4.0, 5.0, 6.0])
-    figure = result_over_keys(7.16, {"key": values}, ["ds"] * 6, result, "figure")
+    figure = result_over_keys(7.16, {"key": [1.0] * 3 + [2.0] * 3}, ["ds"] * 6, result, "figure")
     band = figure.axes[0].collections[0].get_paths()[0].vertices
     assert {(x, y) for x, y in band.tolist()} >= {(1.0, 1.0), (1.0, 9.0), (2.0, 4.0), (2.0, 6.0)}
     assert figure.axes[0].lines[0].get_ydata().tolist() == [2.0, 5.0]
@@ -206,7 +203,6 @@ def test_numbers_along_an_axis_do_not_cover_each_other(x):
 
 
 def test_warnings_stand_below_the_table_of_pairs():
-    lines = str(uwbsim.preview("nlos_office/office")).splitlines()
-    warned = [line.startswith("warning:") for line in lines]
+    warned = [line.startswith("warning:") for line in str(uwbsim.preview("nlos_office/office")).splitlines()]
     assert any(warned)
     assert warned == sorted(warned)

@@ -10,7 +10,6 @@ from tests import pages, processes
 from uwblink import raw_range
 from uwblink.pages import figures
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, elapsed
-from uwbsim.protocols.comparison import compare
 from uwbsim.protocols.conditions import calibrated, conditions_of
 from uwbsim.protocols.prediction import broadcast_variances_m2
 
@@ -56,10 +55,9 @@ def test_broadcasts_and_differences_err_as_predicted(white, seconds, part):
     """20 s have 25 000 frames of five tags, a tenth as many for each pair: deviations are known to 1 %, of 4 s to 2."""
     scenario = fleet_world(white, seconds)
     flight = uwbsim.simulate(scenario)
-    found = {one.method: one for one in compare(scenario, ["ds"], 1).fleet}
+    found = {one.method: one for one in uwbsim.compare(scenario, ["ds"], 1).fleet}
     assert list(found) == ["ds", "broadcast", "tdoa"]
-    errors = raw_range(flight.exchanges) - flight.truth_m
-    assert np.std(errors) == pytest.approx(found["broadcast"].std_m, rel=part)
+    assert np.std(raw_range(flight.exchanges) - flight.truth_m) == pytest.approx(found["broadcast"].std_m, rel=part)
     assert found["broadcast"].rmse_m == pytest.approx(found["broadcast"].std_m, rel=0.01)
     heard = {name: column[flight.overheard["listener"] == 9] for name, column in flight.overheard.items()}
     assert np.std(differences_m(heard)) == pytest.approx(found["tdoa"].std_m, rel=part)

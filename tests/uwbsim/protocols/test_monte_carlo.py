@@ -12,8 +12,6 @@ from tests.errors import one_line
 from tests.uwbsim.simulation.test_protocols import bench
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT, Board
 from uwblink.twr import COLUMNS, raw_range
-from uwbsim import load, simulate
-from uwbsim.protocols.comparison import compare, optimum
 from uwbsim.protocols.conditions import Conditions, conditions_of, range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.radio import SIGMA, Radio
@@ -34,8 +32,8 @@ def world(count=16_384, **values):
 @pytest.mark.parametrize("name", NAMES)
 def test_without_contention_the_stamps_are_those_of_the_event_loop(name):
     settings = [f"ranging.protocol={name}", "ranging.rate_hz=100", "run.duration_s=10"]
-    scenario = load(SCENARIOS / "icra2023" / "train.toml", settings)
-    loop, columns = simulate(scenario), simulate(scenario, contention=False)
+    scenario = uwbsim.load(SCENARIOS / "icra2023" / "train.toml", settings)
+    loop, columns = uwbsim.simulate(scenario), uwbsim.simulate(scenario, contention=False)
     for column in COLUMNS:
         np.testing.assert_array_equal(getattr(loop.exchanges, column), getattr(columns.exchanges, column), column)
     np.testing.assert_array_equal(loop.truth_m, columns.truth_m)
@@ -44,8 +42,8 @@ def test_without_contention_the_stamps_are_those_of_the_event_loop(name):
 @pytest.mark.parametrize("name", SOME_SLOW)
 def test_means_and_variances_are_those_of_integer_stamps(name):
     settings = [f"ranging.protocol={name}", "ranging.rate_hz=100", "run.duration_s=300", "radio.tx_noise_ps=40"]
-    scenario = load(SCENARIOS / "icra2023" / "test1.toml", settings)
-    flight = simulate(scenario, contention=False)
+    scenario = uwbsim.load(SCENARIOS / "icra2023" / "test1.toml", settings)
+    flight = uwbsim.simulate(scenario, contention=False)
     exact = raw_range(flight.exchanges) - flight.truth_m
     # The same 30 000 states, so what remains is the noise: 300 000 ranges against them.
     states = conditions_of(scenario, 30_000)
@@ -115,18 +113,16 @@ def test_the_alternative_is_neiryncks():
     c = world(1, rx_std=1e-10, tx_std=1e-10)
     single = (SPEED_OF_LIGHT * 1e-10) ** 2
     assert predict(PROTOCOLS["ds-sym"], c).variance_m2[0] == pytest.approx(0.75 * single, rel=1e-3)
-    skewed = world(1, rate=(12e-6, 4e-6))
-    assert predict(PROTOCOLS["ds-sym"], skewed).mean_m[0] == pytest.approx(5 * 8e-6, rel=1e-3)
+    assert predict(PROTOCOLS["ds-sym"], world(1, rate=(12e-6, 4e-6))).mean_m[0] == pytest.approx(5 * 8e-6, rel=1e-3)
 
 
 def test_carrier_noise_adds_half_the_reply_times_it():
     c = world(1, carrier_std_ppm=0.2)
-    expected = 0.5 * SPEED_OF_LIGHT * 1538.7e-6 * 0.2e-6
-    assert np.sqrt(predict(PROTOCOLS["ss-cfo"], c).parts_m2["carrier integrator"][0]) == pytest.approx(
-        expected, rel=1e-6
-    )
-    assert abs(predict(PROTOCOLS["ss-cfo"], c).mean_m[0]) < 1e-4
-    assert predict(PROTOCOLS["ss"], c).parts_m2["carrier integrator"][0] == 0
+    by_carrier, plain = (predict(PROTOCOLS[name], c) for name in ("ss-cfo", "ss"))
+    expected_m = 0.5 * SPEED_OF_LIGHT * 1538.7e-6 * 0.2e-6
+    assert np.sqrt(by_carrier.parts_m2["carrier integrator"][0]) == pytest.approx(expected_m, rel=1e-6)
+    assert abs(by_carrier.mean_m[0]) < 1e-4
+    assert plain.parts_m2["carrier integrator"][0] == 0
 
 
 @pytest.mark.parametrize("name", [name for name in SIGMA if name != "none"])
@@ -157,8 +153,7 @@ def test_protocols_see_the_same_noise():
 def test_a_world_of_many_states_meets_each_in_turn():
     c = replace(world(3), flight=np.array([1.0, 2.0, 3.0]) / SPEED_OF_LIGHT, late=np.array([0.0, 1e-9, 2e-9]))
     errors = range_errors_m(PROTOCOLS["ds"], c, 1, 7)
-    expected = np.array([0, 1, 2, 0, 1, 2, 0]) * 1e-9 * SPEED_OF_LIGHT
-    np.testing.assert_allclose(errors, expected, atol=1e-4)
+    np.testing.assert_allclose(errors, np.array([0, 1, 2, 0, 1, 2, 0]) * 1e-9 * SPEED_OF_LIGHT, atol=1e-4)
 
 
 # What the workbench takes, and what it refuses: parameters by name, in one line.
@@ -170,35 +165,35 @@ SHORT = uwbsim.load(NOISELESS, {"run.duration_s": 2.0, "radio.rx_noise_ps": 100.
 
 def test_protocols_are_names_rows_or_all():
     row = replace(PROTOCOLS["ds"], name="ds-again")
-    found = compare(SHORT, ["ds", row, PROTOCOLS["ds"]], count=500)
+    found = uwbsim.compare(SHORT, ["ds", row, PROTOCOLS["ds"]], count=500)
     assert [one.protocol for one in found.outcomes] == ["ds", "ds-again"]
     np.testing.assert_array_equal(found.samples["ds"], found.samples["ds-again"])
-    assert [one.protocol for one in compare(SHORT, count=10).outcomes] == list(PROTOCOLS)
-    assert optimum(SHORT, row).delay_s == optimum(SHORT, "ds").delay_s
+    assert [one.protocol for one in uwbsim.compare(SHORT, count=10).outcomes] == list(PROTOCOLS)
+    assert uwbsim.optimum(SHORT, row).delay_s == uwbsim.optimum(SHORT, "ds").delay_s
     said = uwbsim.predict_state(uwbsim.State(protocol=row))
     assert said.std_m == uwbsim.predict_state(uwbsim.State(protocol="ds")).std_m
 
 
 def test_a_scenario_may_be_a_file():
-    assert optimum(NOISELESS, "ss").protocol == "ss"
+    assert uwbsim.optimum(NOISELESS, "ss").protocol == "ss"
 
 
 def test_results_print_themselves():
-    lines = repr(compare(SHORT, ["ss", "ds"], count=100)).splitlines()
+    lines = repr(uwbsim.compare(SHORT, ["ss", "ds"], count=100)).splitlines()
     assert [line.split()[0] for line in lines] == ["protocol", "ss", "ds"]
     assert max(map(len, lines)) <= 100
-    assert repr(optimum(SHORT, "ds")).startswith("ds: best delay ")
+    assert repr(uwbsim.optimum(SHORT, "ds")).startswith("ds: best delay ")
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: compare(SHORT, ["tdoa"]), "`protocols`: found 'tdoa', allowed: ss, ss-cfo, ds"),
-        (lambda: compare(SHORT, []), "`protocols`: found none, allowed"),
-        (lambda: compare(SHORT, ["ss"], count=0), "`count`: found 0, expected 1 to 50000000"),
-        (lambda: optimum(SHORT, "tdoa"), "`protocol`: found 'tdoa'"),
-        (lambda: optimum(SHORT, "ds", -1e-3), "`overhead_s`: found -0.001, expected seconds, 0 or more"),
-        (lambda: optimum(SHORT, "ds", float("nan")), "`overhead_s`: found nan"),
+        (lambda: uwbsim.compare(SHORT, ["tdoa"]), "`protocols`: found 'tdoa', allowed: ss, ss-cfo, ds"),
+        (lambda: uwbsim.compare(SHORT, []), "`protocols`: found none, allowed"),
+        (lambda: uwbsim.compare(SHORT, ["ss"], count=0), "`count`: found 0, expected 1 to 50000000"),
+        (lambda: uwbsim.optimum(SHORT, "tdoa"), "`protocol`: found 'tdoa'"),
+        (lambda: uwbsim.optimum(SHORT, "ds", -1e-3), "`overhead_s`: found -0.001, expected seconds, 0 or more"),
+        (lambda: uwbsim.optimum(SHORT, "ds", float("nan")), "`overhead_s`: found nan"),
         (lambda: uwbsim.predict_state(uwbsim.State(protocol="x")), "`protocol`: found 'x'"),
         (lambda: uwbsim.predict_state(uwbsim.State(skew_ppm=float("inf"))), "`skew_ppm`: found inf, expected a number"),
         (lambda: uwbsim.predict_state(uwbsim.State(distance_m=-1)), "`distance_m`: found -1, expected 0 or more"),
@@ -214,7 +209,9 @@ def test_arguments_that_cannot_be(call, message):
     assert "--" not in str(caught.value)
 
 
-@pytest.mark.parametrize("call", [lambda world: compare(world, ["ds"], count=10), lambda world: optimum(world, "ds")])
+@pytest.mark.parametrize(
+    "call", [lambda world: uwbsim.compare(world, ["ds"], count=10), lambda world: uwbsim.optimum(world, "ds")]
+)
 def test_a_scenario_that_plans_no_exchange_is_refused(call):
     with pytest.raises(uwbsim.ScenarioError, match=r"run\.duration_s"):
         call(uwbsim.load(NOISELESS, {"run.duration_s": 0.001}))
@@ -266,8 +263,7 @@ def test_prediction_monte_carlo_and_flight_agree(protocol):
     world = scenario(protocol)
     conditions = conditions_of(world)
     predicted = np.sqrt(predict(PROTOCOLS[protocol], conditions).pooled()[1])
-    drawn = np.std(range_errors_m(PROTOCOLS[protocol], conditions, 1, 20_000))
-    assert drawn == pytest.approx(predicted, rel=0.03)
+    assert np.std(range_errors_m(PROTOCOLS[protocol], conditions, 1, 20_000)) == pytest.approx(predicted, rel=0.03)
     assert np.std(errors_m(world)) == pytest.approx(predicted, rel=0.06)
 
 
@@ -278,9 +274,7 @@ def test_prediction_has_the_closed_form(protocol):
 
 
 def test_served_boards_lose_as_much():
-    world = scenario()
-
-    first = Board(uwbsim.VirtualPorts(world).port(1))
+    first = Board(uwbsim.VirtualPorts(scenario()).port(1))
     ranges = [first.range(2).range_m for _ in range(200)]
     # 200 exchanges know a deviation to 5 %; whole ticks and the grid are in it, too.
     assert np.std(ranges) == pytest.approx(closed_form_m("ds"), rel=0.15)

@@ -37,8 +37,7 @@ def calibrated_error_m(scenario):
     e = result.exchanges
     assert len(e) > 0
     planted = [scenario.planted()["delays_ns"][k] * 1e-9 for k in ("1", "2")]
-    weights = delay_weights(e)
-    correction = SPEED_OF_LIGHT * sum(w * d for w, d in zip(weights, planted, strict=True))
+    correction = SPEED_OF_LIGHT * sum(w * d for w, d in zip(delay_weights(e), planted, strict=True))
     return raw_range(e) + correction - result.truth_m
 
 
@@ -49,8 +48,7 @@ SKEWS = [(0.0, 0.0), (20.0, -20.0), (-20.0, 20.0), (3.3, 9.9)]
     ("protocol", "skews"), [("ss", SKEWS[0]), *((name, skews) for name in ("ds", "ds-alt") for skews in SKEWS)]
 )
 def test_noiseless_ranges_are_true_within_a_tick(protocol, skews):
-    scenario = bench(protocol, skews, delays=(-0.36, 0.24))
-    assert np.abs(calibrated_error_m(scenario)).max() < METRES_PER_TICK
+    assert np.abs(calibrated_error_m(bench(protocol, skews, delays=(-0.36, 0.24)))).max() < METRES_PER_TICK
 
 
 @pytest.mark.parametrize(
@@ -154,7 +152,6 @@ def test_a_list_waits_for_who_cannot_hear_the_one_before():
 
 def test_a_plan_from_a_file(tmp_path):
     (tmp_path / "plan.csv").write_text("time_s,initiator,target\n0.5,3,1\n0.1,1,2\n")
-    slots = ((0.5, 3, 1), (0.1, 1, 2))
-    e = simulate(ring(plan={"file": "plan.csv", "slots": slots})).exchanges
+    e = simulate(ring(plan={"file": "plan.csv", "slots": ((0.5, 3, 1), (0.1, 1, 2))})).exchanges
     assert e.initiator.tolist() == [1, 3]
     np.testing.assert_allclose(e.time_ns * 1e-9, [0.1, 0.5], atol=0.001)

@@ -5,14 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import uwbsim
 from calib import Calibration
 from tests import processes
 from tests.uwbsim.twins.worlds import box, known, world
 from uwblink import PROTOCOLS, Exchanges, Poses, Tag, UwblinkError, load
-from uwbsim.cli.commands import _print_table, app
+from uwbsim.cli.commands import _print_table
 from uwbsim.pages import TWIN_COLUMNS
 from uwbsim.scenario.radio import Radio
 from uwbsim.twins import TWIN_LEVEL
@@ -46,27 +45,30 @@ def test_rates_and_noises_are_found(found):
     """2250 ratios with 0.12 ppm each tell a rate to some 4e-3 ppm, and noise to 1.5 %."""
     planted = [tag["skew_ppm"] for tag in world()["tags"]]
     assert centred([tag.skew_ppm for tag in found.scenario.tags]) == pytest.approx(centred(planted), abs=0.01)
-    # Whole ticks add their twelfth to the noise of stamps.
-    assert found.found["receive_noise_ps"] == pytest.approx(np.hypot(95.0, 15.65 / np.sqrt(12)), rel=0.05)
-    assert found.found["carrier_noise_ppm"] == pytest.approx(0.2, rel=0.05)
-    assert found.found["carrier_bias_ppm"] == pytest.approx(-0.13, abs=0.01)
-
-
-def test_reflections_are_found(found):
-    """Three pairs that are drawn anew every 0.25 s, 720 times in all, with a share of 0.2: 1.5 points of chance."""
-    assert found.found["reflected_share"] == pytest.approx(0.2, abs=0.02)
-    assert found.found["reflection_life_s"] == pytest.approx(0.25, rel=0.2)
-    assert found.found["mean_excess_m"] == pytest.approx(0.45, rel=0.2)
-    assert found.found["reflection_loss_db"] == pytest.approx(6.0, abs=0.5)
-    assert found.found["mean_delay_ns"] == pytest.approx(0.0, abs=0.01)
-    assert found.found["direct_std_m"] < 0.01
-
-
-def test_powers_are_found(found):
-    assert found.found["path_loss_exponent"] == pytest.approx(2.4, abs=0.1)
-    # Which ranges are reflected is not known for certain, and what is not known looks like fading.
-    assert found.found["fading_db"] < 0.4
     assert [tag.tx_power_db for tag in found.scenario.tags] == pytest.approx([0.0] * 3, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("name", "planted"),
+    [
+        # Whole ticks add their twelfth to the noise of stamps.
+        ("receive_noise_ps", pytest.approx(np.hypot(95.0, 15.65 / np.sqrt(12)), rel=0.05)),
+        ("carrier_noise_ppm", pytest.approx(0.2, rel=0.05)),
+        ("carrier_bias_ppm", pytest.approx(-0.13, abs=0.01)),
+        # Three pairs are drawn anew every 0.25 s, 720 times in all, with a share of 0.2: 1.5 points of chance.
+        ("reflected_share", pytest.approx(0.2, abs=0.02)),
+        ("reflection_life_s", pytest.approx(0.25, rel=0.2)),
+        ("mean_excess_m", pytest.approx(0.45, rel=0.2)),
+        ("reflection_loss_db", pytest.approx(6.0, abs=0.5)),
+        ("mean_delay_ns", pytest.approx(0.0, abs=0.01)),
+        ("direct_std_m", pytest.approx(0.0, abs=0.01)),
+        ("path_loss_exponent", pytest.approx(2.4, abs=0.1)),
+        # Which ranges are reflected is not known for certain, and what is not known looks like fading.
+        ("fading_db", pytest.approx(0.0, abs=0.4)),
+    ],
+)
+def test_what_was_planted_is_found(found, name, planted):
+    assert found.found[name] == planted
 
 
 def test_of_a_long_flight_blocks_all_over_it_are_taken(found):
@@ -75,8 +77,7 @@ def test_of_a_long_flight_blocks_all_over_it_are_taken(found):
     part = whole[rows]
     assert len(part) == 4000
     assert np.count_nonzero(np.diff(rows) > 1) == 1
-    assert part.time_s[-1] == whole.time_s[-1]
-    assert part.exchanges.rx2.tolist() == whole.exchanges.rx2[rows].tolist()
+    assert (part.time_s[-1], part.exchanges.rx2.tolist()) == (whole.time_s[-1], whole.exchanges.rx2[rows].tolist())
     assert np.array_equal(whole.some(9000), np.arange(9000))
 
 
@@ -103,8 +104,7 @@ def test_exchanges_that_were_logged_together_do_not_collide(tmp_path):
     times = -(-flight.exchanges.time_ns // 30_000_000) * 30_000_000
     together = replace(flight, exchanges=replace(flight.exchanges, time_ns=times))
     uwbsim.twin(together, known(world())).save(tmp_path / "t.toml")
-    again = uwbsim.simulate(tmp_path / "t.toml")
-    assert len(again.exchanges) > 0.98 * len(flight.exchanges)
+    assert len(uwbsim.simulate(tmp_path / "t.toml").exchanges) > 0.98 * len(flight.exchanges)
 
 
 def test_a_twin_of_a_twin_is_alike(found):
@@ -125,12 +125,10 @@ def test_what_persists_differently_is_not_alike(found):
 
 
 @pytest.mark.slow
-def test_the_command_writes_a_scenario_and_a_page(tmp_path, monkeypatch):
+def test_the_command_writes_a_scenario_and_a_page(tmp_path):
     uwbsim.simulate(world(4.0), contention=False).save(tmp_path / "f.uwb")
     (tmp_path / "c.json").write_text(json.dumps(known(world())))
-    monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(app, ["twin", "f.uwb", "-c", "c.json", "-o", "t.toml", "--seeds", "1"])
-    assert done.exit_code == 0, done.output
+    processes.succeed("uwbsim", "twin", "f.uwb", "-c", "c.json", "-o", "t.toml", "--seeds", 1, cwd=tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c.json", "f.uwb", "t.html", "t.poses.uwb", "t.toml"]
     page = (tmp_path / "t.html").read_text()
     assert "Properties that the recording does not determine" in page
@@ -159,9 +157,8 @@ def test_recordings_without_a_twin(flight, what):
 def test_a_recording_that_says_too_little_ends_with_status_1(tmp_path):
     uwbsim.simulate(uwbsim.load("noiseless", {"run.duration_s": 0.2})).save(tmp_path / "short.uwb")
     (tmp_path / "c.json").write_text(json.dumps(known(world())))
-    done = processes.run("uwbsim", "twin", "short.uwb", "-c", "c.json", "-o", "twin.toml", cwd=tmp_path)
-    assert done.returncode == 1
-    assert "exchanges, but a twin needs 100 or more" in done.stderr
+    words = ("uwbsim", "twin", "short.uwb", "-c", "c.json", "-o", "twin.toml")
+    processes.refuse(*words, cwd=tmp_path, status=1, naming=["exchanges, a twin needs 100 or more"])
 
 
 CURVE = known(world())["bias_curve"]
@@ -207,9 +204,8 @@ def test_nothing_is_written_where_something_is_wrong(flight, tmp_path):
     flight.save(tmp_path / "f.uwb")
     (tmp_path / "c.json").write_text("{}")
     (tmp_path / "t.html").write_text("mine")
-    for output, message in (("t.toml", "already exists"), ("u.txt", "found .txt"), ("u.toml", "no schema_version")):
-        command = ["twin", str(tmp_path / "f.uwb"), "-c", str(tmp_path / "c.json"), "-o", str(tmp_path / output)]
-        assert message in str(CliRunner().invoke(app, command).exception)
+    for output, message in (("t.toml", "exists already"), ("u.txt", "found .txt"), ("u.toml", "no schema_version")):
+        processes.refuse("uwbsim", "twin", "f.uwb", "-c", "c.json", "-o", output, cwd=tmp_path, naming=[message])
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c.json", "f.uwb", "t.html"]
     assert len(load(tmp_path / "f.uwb").poses) > 0
 
@@ -302,9 +298,6 @@ def test_shares_are_found_of_all_and_of_pairs(made, reflected_found):
     assert reflected_found.pair_share == pytest.approx(own, abs=0.03)
     assert np.corrcoef(reflected_found.pair_share, asked)[0, 1] > 0.95
     assert np.std(reflected_found.pair_share) > 0.04
-
-
-def test_the_tail_and_the_core_are_found(reflected_found):
     assert reflected_found.mean_excess_m == pytest.approx(0.4, rel=0.1)
     assert reflected_found.direct_std_m == pytest.approx(0.04, rel=0.05)
     assert np.mean(list(reflected_found.delays_ns.values())) == pytest.approx(0.0, abs=0.02)
@@ -405,17 +398,24 @@ def test_antennas_and_offsets_are_told_apart(other_found):
     assert [tags[k].power_offset_db for k in (1, 2, 3, 4)] == pytest.approx([0.0, 0.0, 3.0, 0.0], abs=0.05)
 
 
-def test_fading_is_no_noise_of_readings(other_found):
-    assert other_found.found["fading_db"] == pytest.approx(1.5, rel=0.1)
-    assert other_found.found["fading_life_s"] == pytest.approx(0.1, rel=0.25)
-    assert other_found.found["power_noise_db"] == pytest.approx(0.5, rel=0.05)
-    assert other_found.found["path_loss_exponent"] == pytest.approx(2.4, abs=0.1)
+@pytest.mark.parametrize(
+    ("name", "planted"),
+    [
+        ("fading_db", pytest.approx(1.5, rel=0.1)),
+        ("fading_life_s", pytest.approx(0.1, rel=0.25)),
+        ("power_noise_db", pytest.approx(0.5, rel=0.05)),
+        ("path_loss_exponent", pytest.approx(2.4, abs=0.1)),
+        ("reflected_share", 0.0),
+        ("saturation_dbm", None),
+    ],
+)
+def test_fading_is_no_noise_no_reflection_and_no_saturation(other_found, name, planted):
+    assert other_found.found[name] == planted
 
 
 def test_losses_come_in_bursts(other_found):
     outages = other_found.scenario.radio.outages
     assert (outages.share, outages.life_s) == (pytest.approx(0.1, abs=0.02), pytest.approx(0.2, rel=0.3))
-    assert other_found.found["reflected_share"] == 0.0
 
 
 def test_readings_that_saturate_are_told_from_powers_that_end():
@@ -424,10 +424,6 @@ def test_readings_that_saturate_are_told_from_powers_that_end():
     saturated = uwbsim.twin(uwbsim.simulate(tables, contention=False), known(tables))
     assert saturated.found["saturation_dbm"] == pytest.approx(-82.0, abs=0.3)
     assert saturated.found["path_loss_exponent"] == pytest.approx(2.4, abs=0.2)
-
-
-def test_powers_without_saturation_have_none(other_found):
-    assert other_found.found["saturation_dbm"] is None
 
 
 def test_a_mast_stands_and_robots_fly_as_recorded(other_found):

@@ -40,8 +40,7 @@ def subticks(seconds):
 
 def ahead_s(clock, time, tag):
     """By how much a clock is ahead of true time since its start."""
-    which = np.full(len(time), tag)
-    return (clock.read(which, time) - time - clock.offset[tag]) / SUBTICKS_PER_SECOND
+    return (clock.read(np.full(len(time), tag), time) - time - clock.offset[tag]) / SUBTICKS_PER_SECOND
 
 
 def test_skew_and_a_ramp_are_what_readings_gain():
@@ -171,8 +170,7 @@ def test_a_carried_body_stands_still_and_goes_on_smoothly():
         Carried(model="carried", places_m=((0, 0, 1), (2, 0, 1), (1, 1, 1)), stay_s=20.0, carry_s=5.0), 100.0
     )
     held = path.position_m(np.array([0.0, 20.0, 22.5, 25.0, 45.0, 50.0, 99.0]))
-    expected = [(0, 0, 1)] * 2 + [(1, 0, 1)] + [(2, 0, 1)] * 2 + [(1, 1, 1)] * 2
-    np.testing.assert_allclose(held, expected, atol=1e-12)
+    np.testing.assert_allclose(held, [(0, 0, 1)] * 2 + [(1, 0, 1)] + [(2, 0, 1)] * 2 + [(1, 1, 1)] * 2, atol=1e-12)
     steps = np.diff(path.position_m(np.linspace(0, 100, 10_001)), axis=0)
     assert np.linalg.norm(steps, axis=1).max() * 100 < 2 / 5 * 1.51
 
@@ -236,8 +234,7 @@ def test_perfect_readings_integrate_to_the_flight():
     world = turn.apply(columns(found.imu, "a")) - (0, 0, 9.81)
     start = (place[1] - place[0]) / (time[1] - time[0]) - world[0] * (time[1] - time[0]) / 2
     speed = start + cumulative_trapezoid(world, time, axis=0, initial=0)
-    away = place[0] + cumulative_trapezoid(speed, time, axis=0, initial=0) - place
-    assert np.abs(away).max() < 2e-3
+    assert np.abs(place[0] + cumulative_trapezoid(speed, time, axis=0, initial=0) - place).max() < 2e-3
 
 
 def test_a_body_at_rest_feels_what_holds_it_up_and_errs_by_its_grade():

@@ -12,7 +12,6 @@ import uwbsim
 from tests.uwbsim.world.helpers import served
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT, Board, Recording, raw_range
 from uwblink.ticks import METRES_PER_TICK
-from uwbsim.errors import ScenarioError
 from uwbsim.protocols.conditions import conditions_of, range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.world.channel import CHANNEL_EFFECTS
@@ -124,7 +123,7 @@ def test_a_profile_from_a_file_and_what_the_recording_tells(tmp_path, monkeypatc
 
 
 def test_a_hole_in_a_profile_is_one_line(tmp_path):
-    with pytest.raises(ScenarioError, match=r"bodies\[0\]\.temperature_c.*times_s: .* must increase"):
+    with pytest.raises(uwbsim.ScenarioError, match=r"bodies\[0\]\.temperature_c.*times_s: .* must increase"):
         scenario(bodies=({"temperature_c": {"model": "table", "times_s": [0, 0], "values": [1, 2]}}, {}))
 
 
@@ -187,8 +186,7 @@ def test_readings_of_power_saturate():
     found = []
     for at_1m_dbm in (-100.0, -68.0, -40.0):
         radio = {"quantize": False, "first_path_at_1m_dbm": at_1m_dbm, "sensitivity_dbm": -120.0}
-        flight = uwbsim.simulate(scenario(radio=radio | {"saturation_dbm": -80.0}))
-        found.append(flight.exchanges.fpp1_dbm[0])
+        found.append(uwbsim.simulate(scenario(radio=radio | {"saturation_dbm": -80.0})).exchanges.fpp1_dbm[0])
     middle = -80 - 10 / 1.5 * np.log10(1 + 10 ** (-0.15 * ((-68 - 20 * np.log10(4)) + 80)))
     np.testing.assert_allclose(found, [-100 - 20 * np.log10(4), middle, -80.0], atol=2e-3)
     assert middle == pytest.approx(-82.0, abs=0.05), "as strong as the highest: 2 dB below it"
@@ -273,8 +271,7 @@ def test_it_shows_in_what_listeners_overhear(both):
     np.testing.assert_allclose(before["fpp1_dbm"], after["fpp1_dbm"], atol=1e-9)
     np.testing.assert_allclose(before["fpp2_dbm"] - after["fpp2_dbm"], LOSS_DB, atol=1e-9)
     # The response leaves later by the poll's way more, and is on its way longer by as much.
-    shift = (after["rx2"] - after["rx1"]) - (before["rx2"] - before["rx1"])
-    np.testing.assert_allclose(shift, 2 * TICKS, atol=1)
+    np.testing.assert_allclose((after["rx2"] - after["rx1"]) - (before["rx2"] - before["rx1"]), 2 * TICKS, atol=1)
 
 
 def test_it_shows_in_served_boards_and_their_listeners(both):
@@ -290,8 +287,7 @@ def test_it_shows_in_the_workbench_draw_for_draw(both):
     before, after = (found[2] for found in both)
     np.testing.assert_allclose(before.power_dbm - after.power_dbm, LOSS_DB, atol=1e-9)
     for errors in (lambda c: range_errors_m(PROTOCOLS["ds"], c, 1, 500), lambda c: predict(PROTOCOLS["ds"], c).mean_m):
-        longer = errors(after)[0] - errors(before)[0]
-        assert longer == pytest.approx(TICKS * METRES_PER_TICK, abs=1e-6)
+        assert errors(after)[0] - errors(before)[0] == pytest.approx(TICKS * METRES_PER_TICK, abs=1e-6)
 
 
 @pytest.mark.parametrize(
