@@ -208,8 +208,8 @@ def stopped(stopped_flight, monkeypatch, tmp_path):
 def test_the_command_writes_it_marks_it_and_ends_with_1(stopped, stopped_flight, tmp_path):
     done, path = stopped
     assert "stopped after" in done.stdout
-    assert "before it settled" in done.stderr
-    assert "NOT SETTLED" in repr(calib.load_calibration(path))
+    assert "before it converged" in done.stderr
+    assert "NOT CONVERGED" in repr(calib.load_calibration(path))
     as_json = processes.run("calib", "fit", stopped_flight, "-o", tmp_path / "d.json", "--json")
     assert (done.returncode, as_json.returncode) == (1, 1)
     for text in (path.read_text(), as_json.stdout):
@@ -224,8 +224,8 @@ def test_commands_that_use_it_warn(stopped, stopped_flight, tmp_path):
         ("export", path, "--to", "csv"),
         ("compare", path, path),
     ):
-        assert "stopped before it settled" in run("calib", *words).stderr, words[0]
-    assert "NOT SETTLED" in run("calib", "show", path).stdout
+        assert "stopped before it converged" in run("calib", *words).stderr, words[0]
+    assert "NOT CONVERGED" in run("calib", "show", path).stdout
 
 
 def test_a_fit_that_settled_is_quiet(stopped_flight, tmp_path):

@@ -88,7 +88,7 @@ def test_another_flight_is_corrected_by_directions_from_its_poses(own, tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert uwblink.load(tmp_path / "c.uwb").exchanges.range_m == pytest.approx(known.apply(there).corrected_m, abs=1e-9)
     uwblink.Contents(exchanges=uwblink.load(second).exchanges).save(tmp_path / "blind.uwb")
-    with pytest.warns(DirectionWarning, match="^blind.uwb: 100 % of the ranges lack the directions"):
+    with pytest.warns(DirectionWarning, match="^blind.uwb: 100 % of the ranges have no known direction"):
         calib.apply(tmp_path / "blind.uwb", known, tmp_path / "d.uwb")
 
 
@@ -133,7 +133,7 @@ def test_a_pattern_that_attitudes_do_not_excite_is_refused_with_the_flight_that_
     still = written(tmp_path / "still.uwb", replace(TEN, turning=0.0), 5)
     for name in ("shared", "tag"):
         words = ("calib", "fit", still, "-o", tmp_path / "x.json", "--pattern", name)
-        refuse(*words, status=1, naming=["tags 1, 2, 3, 4", "turns once around"])
+        refuse(*words, status=1, naming=["tags 1, 2, 3, 4", "makes a full turn"])
         assert not (tmp_path / "x.json").exists()
     assert fitted(replace(TEN, turning=0.0), 5).calibration.patterns == ()
 
@@ -284,7 +284,7 @@ def test_delays_of_calibrations_with_patterns_are_compared_for_the_same_directio
     words = ("calib", "compare", tmp_path / "known.json")
     told = run(*words, tmp_path / "turned.json").stdout
     assert float(told.split("rms apart, probability ")[1].split()[0]) < 1e-3
-    said = "tags 1, 2, 3, 4 have a pattern over direction in one"
+    said = "tags 1, 2, 3, 4 have a pattern over direction in only one"
     refuse(*words, tmp_path / "none.json", status=1, naming=[said])
 
 

@@ -51,7 +51,7 @@ def test_ranges_between_two_sides_are_corrected_and_others_refused_by_name(tmp_p
         left = calib.evaluate(judged, known)
     assert f"{len(judged) - len(among(judged, ACROSS))} of {len(judged)} ranges are left out" in str(caught[0].message)
     assert left.overall == calib.evaluate(among(judged, ACROSS), known).overall
-    with pytest.raises(BadInputError, match="`to`: the data leave the delay of tag 1, 2, 3, 7 free"):
+    with pytest.raises(BadInputError, match="`to`: the data do not determine the delay of tag 1, 2, 3, 7"):
         calib.export(known, "registers")
     assert "pair     1-3  ranges" in "\n".join(delay_lines(known))
     assert calib.Calibration.from_json(known.to_json()) == known

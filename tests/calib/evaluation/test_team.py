@@ -354,7 +354,7 @@ def test_missing_sensors_are_named(change, settings, error, said):
 def test_a_body_with_one_tag_is_named():
     contents = flight(2.0)
     two = (contents.exchanges.initiator != 6) & (contents.exchanges.target != 6)
-    with pytest.warns(WeakHeadingWarning, match="memory: c has one tag that ranges"):
+    with pytest.warns(WeakHeadingWarning, match="memory: c has only one tag"):
         found = calib.localize_team(replace(contents, exchanges=contents.exchanges[two]), PLANTED, CLOSE)
     assert found[1].tracks["variance"].rmse_m < 0.2
 

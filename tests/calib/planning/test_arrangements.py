@@ -80,7 +80,9 @@ def test_delays_stay_open_until_something_tells_them(boards, settings, undetermi
 
 
 def test_a_taped_distance_brings_what_it_is_said_to_bring():
-    tape = next(best for best in calib.plan(5, on="plane", arrangements=3).next_best if "by tape" in best.what)
+    tape = next(
+        best for best in calib.plan(5, on="plane", arrangements=3).next_best if "a measured distance" in best.what
+    )
     with_it = calib.plan(5, on="plane", arrangements=3, taped=1)
     mean = math.sqrt(np.mean(np.square(list(with_it.half_ns.values()))))
     assert mean == pytest.approx(tape.mean_ns, rel=0.05)

@@ -171,7 +171,7 @@ def test_the_verdict_has_the_numbers_that_it_rests_on(page, tables):
         for n in (np.count_nonzero(page.groups()[name]),)
     }
     worst = max(groups, key=lambda name: sure[name])
-    told, stats = found_of(tables, "Is no pair left with a bias?"), groups[worst]
+    told, stats = found_of(tables, "Are all pairs free of bias?"), groups[worst]
     assert worst in told
     numbers = [float(x) for x in re.findall(r"(?<![\d-])[-+]?\d+\.\d+", told)]
     assert numbers == pytest.approx([100 * stats["median_m"], sure[worst], 100 * stats["robust_std_m"]], abs=0.051)
@@ -413,7 +413,7 @@ def test_the_section_has_the_places_and_the_reflected_pair(surveyed):
     heading, text, places, picture, *rest = foundations(surveyed.calibration)
     table = rest[-1]
     assert [type(block) for block in (text, places, picture, table)] == [Text, Table, Picture, Table]
-    assert heading == Heading("What it rests on")
+    assert heading == Heading("Known facts")
     assert "36 mean ranges of pairs in 6 arrangements" in text.text
     assert [row[0] for row in places.rows] == ["1", "2", "3", "4", "5", "6"]
     for width, down in ((3.5, 6), (7.16, 2)):
@@ -440,7 +440,7 @@ def test_reports_of_a_survey_and_of_its_evaluation_say_what_it_rests_on(surveyed
     page = tmp_path / "page.html"
     write_survey_report(page, surveyed.calibration)
     text = page.read_text(encoding="utf-8")
-    assert [part in text for part in ("Fit for use", "What it rests on", '"surveyed"')] == [True, True, False]
+    assert [part in text for part in ("Fit for use", "Known facts", '"surveyed"')] == [True, True, False]
     with pytest.raises(UwblinkError, match=r"page\.html"):
         write_survey_report(page, surveyed.calibration)
     flight = calib.load_ranges(calib.sample_flight(600))

@@ -111,7 +111,7 @@ def test_what_cannot_be_told_is_said_and_widens():
     result = calib.survey(replace(world.ranges, raw_m=world.ranges.raw_m + longer), known="line")
     # Of three boards on a line, any of the three ranges may be the wrong one, longer or too short.
     assert len([(one.first, one.second) for one in result.reflected if one.arrangement == "2"]) > 1
-    assert any(text.startswith("may be reflected, too: ") for text in result.warnings)
+    assert any(text.startswith("may also be reflected: ") for text in result.warnings)
     clean = calib.survey(world.ranges, known="line").calibration
     for tag, delay in result.calibration.delays_ns.items():
         assert abs(delay - world.delays_ns[tag]) < 3 * result.calibration.delays_std_ns[tag]

@@ -78,11 +78,11 @@ def test_an_executor_may_take_its_time_and_may_fail(voltage):
 
 
 def test_commands_and_fields_that_boards_cannot_read_are_refused(monkeypatch):
-    with pytest.raises(uwbsim.UwbsimError, match="GetVoltage: not a command that uwblink knows"):
+    with pytest.raises(uwbsim.UwbsimError, match="GetVoltage: not a registered command of uwblink"):
         register_command(GetVoltage, lambda board: m.IdleSet())
     monkeypatch.setitem(m.COMMANDS, b"R10", Voltage)
     with pytest.raises(
-        uwbsim.UwbsimError, match=r"Voltage\.volts: boards read no printed number from the host; they read"
+        uwbsim.UwbsimError, match=r"Voltage\.volts: boards cannot read printed number from the host; they read"
     ):
         register_command(Voltage, lambda board: m.IdleSet())
 

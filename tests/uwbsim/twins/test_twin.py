@@ -158,7 +158,7 @@ def test_a_recording_that_says_too_little_ends_with_status_1(tmp_path):
     uwbsim.simulate(uwbsim.load("noiseless", {"run.duration_s": 0.2})).save(tmp_path / "short.uwb")
     (tmp_path / "c.json").write_text(json.dumps(known(world())))
     words = ("uwbsim", "twin", "short.uwb", "-c", "c.json", "-o", "twin.toml")
-    processes.refuse(*words, cwd=tmp_path, status=1, naming=["exchanges, a twin needs 100 or more"])
+    processes.refuse(*words, cwd=tmp_path, status=1, naming=["exchanges, but a twin needs 100 or more"])
 
 
 CURVE = known(world())["bias_curve"]
@@ -204,7 +204,7 @@ def test_nothing_is_written_where_something_is_wrong(flight, tmp_path):
     flight.save(tmp_path / "f.uwb")
     (tmp_path / "c.json").write_text("{}")
     (tmp_path / "t.html").write_text("mine")
-    for output, message in (("t.toml", "exists already"), ("u.txt", "found .txt"), ("u.toml", "no schema_version")):
+    for output, message in (("t.toml", "already exists"), ("u.txt", "found .txt"), ("u.toml", "no schema_version")):
         processes.refuse("uwbsim", "twin", "f.uwb", "-c", "c.json", "-o", output, cwd=tmp_path, naming=[message])
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c.json", "f.uwb", "t.html"]
     assert len(load(tmp_path / "f.uwb").poses) > 0
