@@ -6,6 +6,7 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
+from uwblink import RangingPlan, record
 from uwblink.boards.ports import SerialPort
 from uwbsim import Scenario, VirtualPorts
 from uwbsim.boards.server import FaultsFile, Server
@@ -24,6 +25,12 @@ def bench_scenario(seed=1, **radio):
             "tags": [{"id": k, "body": f"b{k}", "skew_ppm": skews[k], "delay_ns": 0.0} for k in places],
         }
     )
+
+
+def record_bench(path, plan=None, ports=None, **more):
+    """Record the boards of the bench in virtual time, at 50 exchanges a second unless a plan says otherwise."""
+    ports = ports or VirtualPorts(bench_scenario())
+    return record(ports.names.values(), path, plan or RangingPlan(rate_hz=50.0), using=ports, **more)
 
 
 @contextmanager

@@ -15,7 +15,6 @@ from typer import rich_utils
 
 import calib
 import uwblink
-import uwbsim
 from calib.cli.commands import app as calib_app
 from calib.cli.judging import spread_tests
 from calib.fitting import known_losses
@@ -58,8 +57,8 @@ def test_help_fits_80_columns_loses_no_word_and_has_examples_that_parse(words, c
     for told in [command.help, *(getattr(p, "help", None) for p in command.params)]:
         assert Text.from_markup(told or "").plain == (told or "").replace("\\[", "["), "brackets that are markup"
         assert [word for word in words_of(told or "") if word not in seen] == [], told
-    assert "\\[" not in text
-    assert "<bool>" not in text, "a flag takes no value"
+    # Brackets are no markup, and a flag takes no value.
+    assert [wrong for wrong in ("\\[", "<bool>") if wrong in text] == []
     if len(words) == 2:
         assert isinstance(command.rich_help_panel, str), "commands stand in panels"
     examples = [line.strip() for line in Text.from_markup(command.epilog).plain.splitlines()[1:] if line.strip()]
@@ -93,7 +92,7 @@ def test_old_names_are_answered_with_the_new_ones(words, new, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def completed(words, cwd=None):
+def completed(words, cwd):
     """Return what a shell is told where it asks for what may follow `words`."""
     asked = {f"_{words[0].upper()}_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(words)}
     asked["COMP_CWORD"] = str(len(words) - 1)
@@ -101,20 +100,19 @@ def completed(words, cwd=None):
 
 
 def test_a_shell_completes_commands_names_and_the_tags_of_a_recording(tmp_path):
-    assert "localize" in completed(["calib", "lo"])
-    assert completed(["calib", "fit", "x.uwb", "--loss", "ca"]) == ["cauchy"]
-    assert completed(["uwbsim", "predict", "--protocol", "ds"]) == ["ds", "ds-alt", "ds-sym"]
-    further = completed(["uwbsim", "optimum", "x.toml", "--protocols", "ss,ds"])
-    assert further == ["ss,ds", "ss,ds-alt", "ss,ds-sym"]
-    world = {"run": {"duration_s": 0.2}, "ranging": {"rate_hz": 50}}
-    world["bodies"] = [
-        {"name": str(tag), "motion": {"model": "static", "position_m": [float(tag), 0.0, 1.0]}} for tag in (1, 7, 71)
-    ]
-    world["tags"] = [{"id": tag, "body": str(tag)} for tag in (1, 7, 71)]
-    uwbsim.simulate(uwbsim.load(world)).save(tmp_path / "f.uwb")
-    assert completed(["calib", "add-tag", "f.uwb", "-c", "c.json", "--tag", "7"], tmp_path) == ["7", "71"]
-    assert completed(["calib", "fit", "f.uwb", "--fix", "1"], tmp_path) == ["1="]
-    assert completed(["calib", "fit", "absent.uwb", "--fix", "1"], tmp_path) == []
+    exchanges = uwblink.Exchanges.from_arrays([1, 7], [7, 71], range_m=[6.0, 64.0])
+    tags = [uwblink.Tag(number, str(number), (0.0, 0.0, 0.0)) for number in (1, 7, 71)]
+    uwblink.Contents(exchanges=exchanges, tags=tags).save(tmp_path / "f.uwb")
+    for line, words in (
+        ("calib lo", ["localize"]),
+        ("calib fit x.uwb --loss ca", ["cauchy"]),
+        ("uwbsim predict --protocol ds", ["ds", "ds-alt", "ds-sym"]),
+        ("uwbsim optimum x.toml --protocols ss,ds", ["ss,ds", "ss,ds-alt", "ss,ds-sym"]),
+        ("calib add-tag f.uwb -c c.json --tag 7", ["7", "71"]),
+        ("calib fit f.uwb --fix 1", ["1="]),
+        ("calib fit absent.uwb --fix 1", []),
+    ):
+        assert completed(line.split(), tmp_path) == words
 
 
 def test_completion_installs_itself(tmp_path):
@@ -130,12 +128,15 @@ def test_what_the_help_lists_is_what_the_packages_know():
         for p in c.params
         if p.metavar and "|" in p.metavar
     }
-    assert set(known_losses()) == set(parameters["calib fit", "loss"])
-    assert set(parameters["uwbsim predict", "protocol"]) == set(PROTOCOLS)
-    assert set(parameters["uwblink export", "to"]) == set(EXPORTERS)
-    known = calib.fit(calib.sample_flight()).calibration
+    for command, option, known in (
+        ("calib fit", "loss", known_losses()),
+        ("uwbsim predict", "protocol", PROTOCOLS),
+        ("uwblink export", "to", EXPORTERS),
+    ):
+        assert set(parameters[command, option]) == set(known)
+    fitted = calib.fit(calib.sample_flight()).calibration
     for form in parameters["calib export", "to"]:
-        assert calib.export(known, form)
+        assert calib.export(fitted, form)
 
 
 HEAVY = ["numpy", "scipy", "duckdb", "matplotlib", "simpy", "serial", "pandas", "pypdf", "rosbags"]
@@ -172,8 +173,7 @@ def test_help_is_printed_before_anything_heavy_is_imported(package):
 
 @pytest.mark.parametrize("command", ["uwbsim", "uwblink", "calib"])
 def test_usage_errors_have_status_2(command):
-    assert processes.run(command, "--nonsense").returncode == 2
-    assert processes.run(command, "nonsense").returncode == 2
+    assert [processes.run(command, word).returncode for word in ("--nonsense", "nonsense")] == [2, 2]
     assert processes.succeed(command, "--version").stdout.splitlines()[0] == f"{command} {uwblink.__version__}"
 
 

@@ -9,7 +9,7 @@ import pytest
 from tests import pages
 from tests.uwblink.test_register_protocol import SYMMETRIC, TARGETS
 from tests.uwbsim.simulation.test_protocols import bench
-from uwblink import PROTOCOLS, SPEED_OF_LIGHT, Recording, register_protocol
+from uwblink import PROTOCOLS, SPEED_OF_LIGHT, load, register_protocol
 from uwblink.twr import delay_weights, raw_range
 from uwbsim import simulate
 from uwbsim.protocols.conditions import Conditions, range_errors_m
@@ -61,12 +61,11 @@ def test_run_show_and_fit(row, tmp_path):
     command("uwbsim", "run", SCENARIO, "-o", flight, *settings)
     assert set(json.loads(command("uwblink", "show", flight, "--json"))["protocols"]) == {row.name}
     command("calib", "fit", flight, "-o", fitted)
-    with Recording.open(flight) as recording:
-        planted = {int(k): v for k, v in recording.meta()["planted"]["delays_ns"].items()}
-        assert set(recording.exchanges().protocol.tolist()) == {row.name}
-    found = {int(k): v for k, v in json.loads(fitted.read_text())["delays_ns"].items()}
+    flown = load(flight)
+    assert set(flown.exchanges.protocol.tolist()) == {row.name}
     # The scenario has no bias; 60 s of noiseless stamps leave a picosecond, and the spline's wiggle.
-    assert found == pytest.approx(planted, abs=5e-3)
+    found = json.loads(fitted.read_text())["delays_ns"]
+    assert found == pytest.approx(flown.meta["planted"]["delays_ns"], abs=5e-3)
 
 
 @pytest.mark.parametrize("row", [SYMMETRIC], indirect=True)
@@ -74,15 +73,12 @@ def test_compare_optimum_and_predict_know_it_without_being_told(row, tmp_path, m
     monkeypatch.setattr("uwblink.pages.figures.drawn", pages.outline)
     compared = json.loads(command("uwbsim", "compare", SCENARIO, "-o", tmp_path / "out", "-n", 4096, "--json"))
     assert [line["protocol"] for line in compared["protocols"]] == list(PROTOCOLS)
-    assert (
-        row.title in (tmp_path / "out" / "compare.html").read_text()
-        or row.name in (tmp_path / "out" / "compare.html").read_text()
-    )
+    page = (tmp_path / "out" / "compare.html").read_text()
+    assert row.title in page or row.name in page
     best = json.loads(command("uwbsim", "optimum", SCENARIO, "--json"))
     assert [line["protocol"] for line in best] == list(PROTOCOLS)
     said = json.loads(command("uwbsim", "predict", "--protocol", row.name, "--json"))
-    assert said["title"] == row.title
-    assert said["std_m"] > 0
+    assert (said["title"], said["std_m"] > 0) == (row.title, True)
 
 
 def test_schema_and_summary_know_it(row):

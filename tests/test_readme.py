@@ -50,16 +50,22 @@ def test_figures_of_real_flights_are_those_of_their_page():
     found = {(row[0], row[1]): [float(cell or "nan") for cell in row[2:]] for row in rows if row[0] in ("s2", "half2")}
     text = README.replace("−", "-")
     raw, ours, authors = found["s2", "none"], found["s2", "ours, by s1"], found["s2", "authors'"]
-    (first,) = re.findall(
-        r"changes from (\S+) to (\S+) cm, (\d+) % of the ranges .* error falls from (\S+) to (\S+) m", text
-    )
-    assert [*map(float, first)] == [raw[1], ours[1], round(ours[3]), raw[4], ours[4]]
-    (flights,) = re.findall(
-        r"STAR-loc, other flight: .*\| (\S+) cm, (\S+) cm, (\S+) % .* (\S+) cm, (\S+) cm, (\S+) % \|", text
-    )
-    assert [*map(float, flights)] == [*ours[1:4], *authors[1:4]]
-    (samples,) = re.findall(r"paper's samples, other half: .*\| (\S+) cm, (\S+) % \| (\S+) cm, (\S+) % \|", text)
-    assert [*map(float, samples)] == [*found["half2", "ours, by half1"][2:4], *found["half2", "authors'"][2:4]]
+    for pattern, expected in (
+        (
+            r"changes from (\S+) to (\S+) cm, (\d+) % of the ranges .* error falls from (\S+) to (\S+) m",
+            [raw[1], ours[1], round(ours[3]), raw[4], ours[4]],
+        ),
+        (
+            r"STAR-loc, other flight: .*\| (\S+) cm, (\S+) cm, (\S+) % .* (\S+) cm, (\S+) cm, (\S+) % \|",
+            [*ours[1:4], *authors[1:4]],
+        ),
+        (
+            r"paper's samples, other half: .*\| (\S+) cm, (\S+) % \| (\S+) cm, (\S+) % \|",
+            [*found["half2", "ours, by half1"][2:4], *found["half2", "authors'"][2:4]],
+        ),
+    ):
+        (numbers,) = re.findall(pattern, text)
+        assert [*map(float, numbers)] == expected
 
 
 @pytest.mark.slow

@@ -73,12 +73,9 @@ def taken_from_duckdb(source):
 
 
 def test_one_module_opens_duckdb():
-    files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
-    naming = [path for path in files if "duckdb" in path.read_text(encoding="utf-8")]
-    found = [
-        path.relative_to(ROOT).as_posix() for path in naming if taken_from_duckdb(path.read_text(encoding="utf-8"))
-    ]
-    assert found == ["uwblink/database.py"]
+    texts = {path: path.read_text(encoding="utf-8") for name in PACKAGES for path in (ROOT / name).rglob("*.py")}
+    found = [path for path, text in texts.items() if "duckdb" in text and taken_from_duckdb(text)]
+    assert found == [ROOT / "uwblink" / "database.py"]
     for source in ("duckdb.connect()", "from duckdb import connect", "x = duckdb.sql"):
         assert taken_from_duckdb(source)
 
@@ -108,9 +105,10 @@ def test_a_sweep_folder_of_a_stranger_holds_results_and_no_programs(place, state
     with duckdb.connect(str(place / "results" / "results.duckdb")) as db:
         for statement in statements:
             db.execute(statement.format(secret=place / "secret.txt"))
-    before = (place / "results" / "results.csv").read_bytes()
+    results = place / "results" / "results.csv"
+    before = results.read_bytes()
     refused("uwbsim", *RESUME, cwd=place, naming=["results.duckdb"])
-    assert (place / "results" / "results.csv").read_bytes() == before
+    assert results.read_bytes() == before
 
 
 def test_the_store_of_a_sweep_is_no_link_to_another_file(place):
@@ -169,19 +167,19 @@ def test_an_allowed_folder_holds_files_of_scenarios(place):
     words = ["s/s.toml", "--set", "ranging.plan={file='../other/slots.csv'}"]
     refused("uwbsim", "validate", *words, cwd=place, naming=["ranging.plan.file", "--allow-files"])
     succeed("uwbsim", "validate", *words, "--allow-files", "other", cwd=place)
-    loaded = uwbsim.load(place / "s" / "s.toml", {"ranging.plan": {"file": "../other/slots.csv"}},
-                         allow_files=[place / "other"])  # fmt: skip
-    assert loaded.ranging.plan.model_dump()["slots"] == ((0.0, 1, 2), (0.1, 2, 3))
+    change = {"ranging.plan": {"file": "../other/slots.csv"}}
+    plan = uwbsim.load(place / "s" / "s.toml", change, allow_files=[place / "other"]).ranging.plan
+    assert plan.model_dump()["slots"] == ((0.0, 1, 2), (0.1, 2, 3))
 
 
 def test_a_sweep_reaches_no_scenario_that_nobody_named(place):
     (place / "s").mkdir()
     plan = place / "s" / "plan.toml"
-    for name in ("../s.toml", str(place / "s.toml"), "/dev/zero"):
+    words = ("uwbsim", "sweep", plan, "-o", place / "out", "--workers", 1)
+    for name in ("/dev/zero", str(place / "s.toml"), "../s.toml"):
         plan.write_text(f"sweep = {{ scenario = '{name}', protocols = ['ds'], ranges = 10 }}\n")
-        refused("uwbsim", "sweep", plan, "-o", place / "out", "--workers", 1, naming=[plan, "sweep.scenario"])
-    plan.write_text("sweep = { scenario = '../s.toml', protocols = ['ds'], ranges = 10 }\n")
-    succeed("uwbsim", "sweep", plan, "-o", place / "out", "--workers", 1, "--allow-files", place)
+        refused(*words, naming=[plan, "sweep.scenario"])
+    succeed(*words, "--allow-files", place)
 
 
 @pytest.mark.parametrize("design", ["grid", "latin-hypercube"])
@@ -264,8 +262,7 @@ def test_what_a_file_says_steers_nothing(hostile, line):
     assert ended.returncode in (0, 2), ended
     assert all(c.isprintable() or c == "\n" for c in ended.stdout + ended.stderr), ended
     assert not list(hostile.parents[2].rglob("evil*"))
-    for page in hostile.glob("*.html"):
-        assert "<script>alert" not in page.read_text()
+    assert not any("<script>alert" in page.read_text() for page in hostile.glob("*.html"))
     for path in [*hostile.glob("out*")]:
         shutil.rmtree(path) if path.is_dir() else path.unlink()
 
@@ -289,9 +286,7 @@ def test_outputs_go_through_no_planted_link(place, line, output):
         if "--force" in line or name != path.name or output.startswith("results"):
             link.symlink_to(secret)
     succeed(*line.split(), cwd=place)
-    assert secret.read_text() == SECRET
-    assert not path.is_symlink()
-    assert path.exists()
+    assert (secret.read_text(), path.is_symlink(), path.exists()) == (SECRET, False, True)
 
 
 def test_no_name_of_a_partial_file_can_be_guessed(place):
@@ -320,27 +315,25 @@ def test_a_live_recording_goes_through_no_planted_link(tmp_path):
         recording.append_tags([uwblink.Tag(1, "a", (0.0, 0.0, 0.0))])
         assert secret.read_text() == SECRET
     assert names(tmp_path) == ["live.uwb", "secret.txt"]
-    assert not path.is_symlink()
-    assert uwblink.load(path).tags[0].body == "a"
+    assert (path.is_symlink(), uwblink.load(path).tags[0].body) == (False, "a")
 
 
 def test_live_poses_go_through_no_planted_link(tmp_path):
-    (tmp_path / "poses.csv").symlink_to(tmp_path / "secret.txt")
-    (tmp_path / "secret.txt").write_text(SECRET)
+    poses, secret = tmp_path / "poses.csv", tmp_path / "secret.txt"
+    poses.symlink_to(secret)
+    secret.write_text(SECRET)
     with served() as server:
-        server.write_poses(tmp_path / "poses.csv")
-    assert (tmp_path / "secret.txt").read_text() == SECRET
-    assert (tmp_path / "poses.csv").read_text().startswith("time_ns,")
+        server.write_poses(poses)
+    assert (secret.read_text(), poses.read_text()[:8]) == (SECRET, "time_ns,")
 
 
 def test_a_log_left_by_the_file_that_is_replaced_goes_with_it(place):
-    path = place / "f.uwb"
     with uwblink.Recording.create(place / "old.uwb", live=True) as recording:
         recording.append_tags([uwblink.Tag(7, "old", (0.0, 0.0, 0.0))])
-        shutil.copy(place / "old.uwb", path)
-        shutil.copy(place / "old.uwb.wal", place / "f.uwb.wal")
-    succeed("calib", "sample", "-o", path, "-n", 100, "--force")
-    assert 7 not in {tag.tag for tag in uwblink.load(path).tags}
+        for suffix in ("uwb", "uwb.wal"):
+            shutil.copy(place / f"old.{suffix}", place / f"f.{suffix}")
+    succeed("calib", "sample", "-o", place / "f.uwb", "-n", 100, "--force")
+    assert 7 not in {tag.tag for tag in uwblink.load(place / "f.uwb").tags}
 
 
 def test_an_output_that_cannot_be_written_leaves_the_folder_that_it_would_have_replaced(place):
@@ -354,8 +347,8 @@ def test_an_output_that_cannot_be_written_leaves_the_folder_that_it_would_have_r
             export_recording(place / "f.uwb", place / "results", to="half", force=True)
     finally:
         EXPORTERS.remove("half")
-    assert "results/results.csv" in names(place)
-    assert not [name for name in names(place) if "half" in name or "partial" in name]
+    left = names(place)
+    assert ("results/results.csv" in left, [name for name in left if "half" in name or "partial" in name]) == (True, [])
 
 
 # Versions of DuckDB.
@@ -375,8 +368,7 @@ def test_what_is_written_the_lowest_allowed_version_reads(place):
         pass
     succeed("calib", "sample", "-o", place / "sample.uwb", "-n", 100)
     made = [*place.glob("*.uwb"), place / "results" / "results.duckdb"]
-    assert {path.name: storage(path) for path in made} == {path.name: STORAGE_OF_1_5 for path in made}
-    assert len(made) == 4
+    assert [storage(path) for path in made] == [STORAGE_OF_1_5] * 4
 
 
 def test_a_file_of_a_newer_duckdb_is_named_so(place):
@@ -391,5 +383,4 @@ def test_a_file_of_a_newer_duckdb_is_named_so(place):
     words = struct.unpack("<511Q", data[8:4096])
     data[:8] = struct.pack("<Q", functools.reduce(operator.xor, (w * 0xBF58476D1CE4E5B9 % 2**64 for w in words), 5381))
     path.write_bytes(data)
-    naming = [path, "DuckDB v9.8.7", f"installed DuckDB {duckdb.__version__}"]
-    refused("uwblink", "show", path, naming=naming)
+    refused("uwblink", "show", path, naming=[path, "DuckDB v9.8.7", f"installed DuckDB {duckdb.__version__}"])

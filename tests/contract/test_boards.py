@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.boards import bench_scenario, two_ports
+from tests.contract.test_firmware import played
 from uwblink.boards.board import Board
 from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
 from uwblink.ticks import elapsed
@@ -47,9 +48,9 @@ def test_every_plain_command_is_answered(pair):
         (m.Reset(), m.ResetDone()),
         (m.GetMaxFrame(), m.MaxFrameReport(100)),
         (m.SetPassive(False), m.PassiveSet()),
+        (m.GetId(), m.IdReport(one.id)),
     ):
         assert one.request(command) == reply
-    assert one.request(m.GetId()) == m.IdReport(one.id)
 
 
 def test_every_kind_of_field_survives_the_way_there_and_back(pair):
@@ -92,11 +93,9 @@ def test_the_target_reports_the_same_numbers_when_asked_to(pair, protocol):
     one, two = pair
     list(two.reports(0.05))
     report = one.range(two.id, protocol=protocol, target_reports=True)
-    said = heard(two, m.TargetRangeReport)
-    assert (len(said), said[0].neighbour) == (1, one.id)
-    for name in m.RangeReport.FIELDS:
-        if name != "neighbour":
-            assert getattr(said[0], name) == getattr(report, name)
+    (said,) = heard(two, m.TargetRangeReport)
+    own = {name: getattr(report, name) for name in m.RangeReport.FIELDS}
+    assert {name: getattr(said, name) for name in own} == own | {"neighbour": one.id}
 
 
 def test_an_absent_target_fails_with_the_board_s_own_line(pair):
@@ -127,29 +126,26 @@ def test_an_impulse_response_comes_with_its_index(pair):
     one, two = pair
     _, response = one.cir(two.id)
     assert ((response.initiator, response.target), len(response.magnitudes)) == ((one.id, two.id), 1016)
-    assert max(response.magnitudes) == max(
-        response.magnitudes[response.first_path_milli // 1000 : response.first_path_milli // 1000 + 60]
-    )
+    first = response.first_path_milli // 1000
+    assert max(response.magnitudes) == max(response.magnitudes[first : first + 60])
     assert one.range(two.id).neighbour == two.id
 
 
 def test_what_would_harm_a_board_is_never_sent(pair):
     one, _ = pair
-    for delay in (279, 6501, 40_000, -5):
-        with pytest.raises(RefusedError, match="280 to 6500"):
-            one.set_response_delay(delay)
-    for length in (58, 80, 92, 93):
-        with pytest.raises(RefusedError, match=rf"broadcast of {length} bytes: at most 57 fit.*one USB packet"):
-            one.send(bytes(length))
-    for number in (float("nan"), float("inf"), 9999.1, -9999.1):
-        with pytest.raises(RefusedError, match="overwrites the board's memory"):
-            one.request(m.DoTests(1, "x", True, number, b""))
-    with pytest.raises(RefusedError, match=r"DoTests of 65 bytes: a command must fit one USB packet of 64"):
-        one.request(m.DoTests(1, "x" * 43, True, 1.0, b"12345"))
+    tests = (m.DoTests(1, "x", True, number, b"") for number in (float("nan"), float("inf"), 9999.1, -9999.1))
+    large = m.DoTests(1, "x" * 43, True, 1.0, b"12345")
+    for send, value, said in (
+        *((one.set_response_delay, delay, "280 to 6500") for delay in (279, 6501, 40_000, -5)),
+        *((one.send, bytes(n), f"broadcast of {n} bytes: at most 57 fit.*one USB packet") for n in (58, 80, 92, 93)),
+        *((one.request, command, "overwrites the board's memory") for command in tests),
+        (one.request, large, "DoTests of 65 bytes: a command must fit one USB packet of 64"),
+        (one.request, m.IdleSet(), None),
+    ):
+        with pytest.raises(RefusedError, match=said):
+            send(value)
     with pytest.raises(RefusedError, match="protocol"):
         one.range(2, protocol="tdoa")
-    with pytest.raises(RefusedError):
-        one.request(m.IdleSet())
     assert one.request(m.GetId()) == m.IdReport(one.id)
 
 
@@ -257,50 +253,33 @@ def test_answers_have_the_firmware_s_shapes_order_and_timing(script):
 
 
 def test_two_commands_in_one_write_execute_the_last_and_retries_are_inherited():
-    ports = VirtualPorts(bench_scenario())
-    board = ports.bench.boards[1]
-    board.write(b"C05|9|0|1|0\r")
-    ports.bench.advance(20 * MS)  # two tries have failed
-    board.write(b"C05|8|0|1|0\r")
-    ports.bench.advance(80 * MS)
-    failed = [t for t, _, data in ports.transfers if data.startswith(b"COMMANDED")]
+    # After 20 ms two tries have failed.
+    ports = played((0, 1, b"C05|9|0|1|0\r"), (20, 1, b"C05|8|0|1|0\r"), until_ms=80)
+    (failed_ns,) = [t for t, _, data in ports.transfers if data.startswith(b"COMMANDED")]
     # Six tries of 7 ms in all, not six more: the newcomer inherits the count.
-    assert len(failed) == 1
-    assert failed[0] < 46 * MS
+    assert failed_ns < 46 * MS
 
 
 def test_a_long_command_that_straddles_a_poll_kills_the_board_in_a_share_of_phases():
     dead = 0
     for seed in range(200):
-        ports = VirtualPorts(bench_scenario(seed))
-        ports.bench.boards[1].write(b"C06|\x50\x00" + b"a" * 80 + b"\r")
-        ports.bench.advance(10 * MS)
-        dead += not ports.bench.boards[1].alive
+        long = (0, 1, b"C06|\x50\x00" + b"a" * 80 + b"\r")
+        dead += not played(long, until_ms=10, ports=VirtualPorts(bench_scenario(seed))).bench.boards[1].alive
     # 55 us between the packets in a period of 1 ms: 5.5 % of phases, 11 of 200, give or take three sigma.
     assert 1 <= dead <= 21
 
 
 def test_a_power_cycle_forgets_passive_listening_and_the_delay():
-    ports = VirtualPorts(bench_scenario())
-    board = ports.bench.boards[3]
-    board.write(b"C04|1\r")
-    ports.bench.advance(5 * MS)
-    board.write(b"C08|3000\r")
-    ports.bench.advance(10 * MS)
+    board = played((0, 3, b"C04|1\r"), (5, 3, b"C08|3000\r"), until_ms=10).bench.boards[3]
     assert (board.passive, board.delay_uus) == (True, 3000)
     board.power_cycle()
     assert (board.passive, board.delay_uus) == (False, 1500)
 
 
 def test_a_listener_that_misses_the_response_prints_26_fields_and_otherwise_nothing():
-    ports = VirtualPorts(bench_scenario(), lost_share=0.3)
-    bench = ports.bench
-    bench.boards[3].write(b"C04|1\r")
-    bench.advance(5 * MS)
-    for k in range(240):
-        bench.advance((10 + 60 * k) * MS)
-        bench.boards[1].write(b"C05|2|1|1|0\r")
-    bench.advance((10 + 60 * 240) * MS)
+    ranging = [(10 + 60 * k, 1, b"C05|2|1|1|0\r") for k in range(240)]
+    lossy = VirtualPorts(bench_scenario(), lost_share=0.3)
+    ports = played((0, 3, b"C04|1\r"), *ranging, until_ms=10 + 60 * 240, ports=lossy)
     counts = Counter(data.count(b"|") for _, tag, data in ports.transfers if tag == 3 and data[:3] == b"S01")
     assert set(counts) == {21, 26}
     # A listener that hears the poll hears the other four frames, of which the last is sent only if the initiator heard

@@ -9,8 +9,15 @@ from uwblink.wire.messages import RangeCommand
 from uwbsim import Scenario, VirtualPorts
 from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, FinalPayload, Received
 
-EVERY = 70 * NS_PER_MS
-"""Six failing tries take 43 ms."""
+
+def played(*writes, until_ms, ports=None):
+    """Write to boards of the bench, (ms, board, bytes) in order of time, and go on for a while."""
+    ports = ports or VirtualPorts(bench_scenario())
+    for ms, board, data in writes:
+        ports.bench.advance(int(ms * NS_PER_MS))
+        ports.bench.boards[board].write(data)
+    ports.bench.advance(int(until_ms * NS_PER_MS))
+    return ports
 
 
 def said(ports, tag, start=b""):
@@ -19,14 +26,10 @@ def said(ports, tag, start=b""):
 
 
 def range_often(ports, command, count, listening=()):
-    bench = ports.bench
-    for tag in listening:
-        bench.boards[tag].write(b"C04|1\r")
-    bench.advance(5 * NS_PER_MS)
-    for k in range(count):
-        bench.advance(10 * NS_PER_MS + k * EVERY)
-        bench.boards[1].write(command)
-    bench.advance(10 * NS_PER_MS + count * EVERY)
+    """Range every 70 ms: six failing tries take 43 ms."""
+    passive = [(0, tag, b"C04|1\r") for tag in listening]
+    ranging = [(10 + 70 * k, 1, command) for k in range(count)]
+    played(*passive, *ranging, until_ms=10 + 70 * count, ports=ports)
 
 
 @pytest.mark.slow
@@ -37,29 +40,21 @@ def test_the_initiator_s_final_can_be_lost_too():
     # The firmware at 40 % loss: 209 S05 to 341 R05. Each R05 has its S05 with 0.6; three sigma of 170.
     assert reports > 125
     assert theirs / reports == pytest.approx(0.6, abs=0.113)
-    alike = {data[6:] for _, data in said(ports, 1, b"R05")}
-    assert {data[6:] for _, data in said(ports, 2, b"S05")} <= alike
+    mine, other = ({data[6:] for _, data in said(ports, *what)} for what in ((1, b"R05"), (2, b"S05")))
+    assert other <= mine
 
 
 @pytest.mark.parametrize(("delay", "works"), [(264, False), (280, True), (6400, True), (6500, True), (6600, False)])
 def test_the_delays_that_work_are_those_of_the_firmware(delay, works):
-    ports = VirtualPorts(bench_scenario())
-    ports.bench.boards[2].write(b"C08|%d\r" % delay)
-    ports.bench.advance(5 * NS_PER_MS)
-    ports.bench.boards[1].write(b"C05|2|1|1|0\r")
-    ports.bench.advance(90 * NS_PER_MS)
-    assert len(said(ports, 1, b"R05")) == len(said(ports, 2, b"S05")) == works
-    assert len(said(ports, 1, b"COMMANDED")) == (not works)
+    ports = played((0, 2, b"C08|%d\r" % delay), (5, 1, b"C05|2|1|1|0\r"), until_ms=90)
+    printed = [len(said(ports, *what)) for what in ((1, b"R05"), (2, b"S05"), (1, b"COMMANDED"))]
+    assert printed == [works, works, not works]
 
 
 def test_a_target_answers_its_host_after_the_exchange():
-    ports = VirtualPorts(bench_scenario())
-    ports.bench.boards[1].write(b"C05|2|1|1|0\r")
-    ports.bench.advance(2 * NS_PER_MS)  # between poll and finals
-    ports.bench.boards[2].write(b"C01\r")
-    ports.bench.advance(20 * NS_PER_MS)
-    kinds = [data[:3] for _, data in said(ports, 2)]
-    assert (kinds, [data[:3] for _, data in said(ports, 1)]) == ([b"S05", b"R01"], [b"R05"])
+    # After 2 ms: between poll and finals.
+    ports = played((0, 1, b"C05|2|1|1|0\r"), (2, 2, b"C01\r"), until_ms=20)
+    assert [[data[:3] for _, data in said(ports, tag)] for tag in (1, 2)] == [[b"R05"], [b"S05", b"R01"]]
 
 
 def sent_frames(ports):
@@ -77,19 +72,12 @@ def sent_frames(ports):
 def test_a_target_that_is_told_to_range_itself_never_sends_its_delayed_reply():
     """Told within the delay of its reply, which is 6 ms here; without target reports nothing keeps it from it."""
     ports = VirtualPorts(bench_scenario())
-    bench, frames = ports.bench, sent_frames(ports)
-    bench.boards[2].write(b"C08|6000\r")
-    bench.advance(5 * NS_PER_MS)
-    bench.boards[1].write(b"C05|2|0|1|0\r")
-    bench.advance(int(7.5 * NS_PER_MS))
-    bench.boards[2].write(b"C05|3|0|1|0\r")
-    bench.advance(80 * NS_PER_MS)  # both try in vain for a while, each in the other's way
-    replies = [f for f in frames if (f.sender, f.receiver) == (2, 1) and isinstance(f.payload, FinalPayload)]
-    assert replies
-    assert replies[0].cancelled
-    assert said(ports, 1, b"R05") == []
-    bench.boards[1].write(b"C05|2|0|1|0\r")
-    bench.advance(100 * NS_PER_MS)
+    frames, asked = sent_frames(ports), b"C05|2|0|1|0\r"
+    # Both try in vain for a while, each in the other's way.
+    played((0, 2, b"C08|6000\r"), (5, 1, asked), (7.5, 2, b"C05|3|0|1|0\r"), until_ms=80, ports=ports)
+    reply = next(f for f in frames if (f.sender, f.receiver) == (2, 1) and isinstance(f.payload, FinalPayload))
+    assert (reply.cancelled, said(ports, 1, b"R05")) == (True, [])
+    played((80, 1, asked), until_ms=100, ports=ports)
     assert len(said(ports, 1, b"R05")) == 1
 
 
@@ -128,9 +116,7 @@ def test_passive_boards_print_zeros_for_tries_that_fail_and_others_warn():
 
 def test_failed_tries_make_bystanders_warn():
     """The delay is too short: the target answers with its response, six times, and never sends its final."""
-    ports = VirtualPorts(bench_scenario())
-    ports.bench.boards[2].write(b"C08|200\r")
-    ports.bench.advance(5 * NS_PER_MS)
+    ports = played((0, 2, b"C08|200\r"), until_ms=5)
     range_often(ports, b"C05|2|0|1|0\r", 1)
     assert Counter(data[:11] for _, data in said(ports, 3)) == {b"WARNING 0xB": 6}
 
@@ -146,16 +132,10 @@ def test_a_listener_that_misses_the_last_frame_is_deaf_until_another_comes():
         return frame
 
     setattr(bench.air, "send", losing)  # noqa: B010 - mypy minds an assignment
-    bench.boards[3].write(b"C04|1\r")
-    bench.advance(5 * NS_PER_MS)
-    bench.boards[1].write(b"C05|2|1|1|0\r")
-    bench.advance(15 * NS_PER_MS)
-    bench.boards[3].write(b"C01\r")
-    bench.advance(300 * NS_PER_MS)
+    played((0, 3, b"C04|1\r"), (5, 1, b"C05|2|1|1|0\r"), (15, 3, b"C01\r"), until_ms=300, ports=ports)
     assert len(said(ports, 2, b"S05")) == 1
     assert [data[:3] for _, data in said(ports, 3)] == [b"R04"], "the air is silent, and the board waits for a frame"
-    bench.boards[1].write(b"C06|\x01\x00x\r")
-    bench.advance(310 * NS_PER_MS)
+    played((300, 1, b"C06|\x01\x00x\r"), until_ms=310, ports=ports)
     assert [data[:3] for _, data in said(ports, 3)] == [b"R04", b"R01"], "which it does not take for a broadcast"
 
 
@@ -163,24 +143,12 @@ def test_passive_boards_answer_late_where_frames_are_lost():
     """Asked 15 ms before the next exchange: the firmware answered 5 of 60 C01s only when that came, the others soon."""
     waits = []
     for seed in range(60):
-        ports = VirtualPorts(bench_scenario(seed), lost_share=0.4)
-        bench = ports.bench
-        bench.boards[3].write(b"C04|1\r")
-        bench.advance(5 * NS_PER_MS)
-        for k in range(4):
-            bench.advance((10 + 60 * k) * NS_PER_MS)
-            bench.boards[1].write(b"C05|2|1|1|0\r")
-        bench.advance(int(bench.env.now) + 45 * NS_PER_MS)
-        asked = int(bench.env.now) / NS_PER_MS
-        bench.boards[3].write(b"C01\r")
-        for k in range(4, 7):
-            bench.advance((10 + 60 * k) * NS_PER_MS)
-            bench.boards[1].write(b"C05|2|1|1|0\r")
-        bench.advance(600 * NS_PER_MS)
-        waits += [t - asked for t, _ in said(ports, 3, b"R01")]
-    late = sum(wait > 10 for wait in waits)
+        asked_ms, ranging = 235, [(ms, 1, b"C05|2|1|1|0\r") for ms in range(10, 400, 60)]
+        writes = sorted([(0, 3, b"C04|1\r"), (asked_ms, 3, b"C01\r"), *ranging])
+        ports = played(*writes, until_ms=600, ports=VirtualPorts(bench_scenario(seed), lost_share=0.4))
+        waits += [t - asked_ms for t, _ in said(ports, 3, b"R01")]
     assert len(waits) > 50
-    assert 1 <= late <= 15
+    assert 1 <= sum(wait > 10 for wait in waits) <= 15
 
 
 def places(positions_m):
@@ -230,12 +198,9 @@ def test_two_exchanges_at_once_disturb_each_other_near_by_and_not_far_away():
     shares = {}
     for distance_m in (3.0, 900.0):
         ports = VirtualPorts(places([0.0, 2.0, distance_m, distance_m + 2.0]))
-        bench, frames = ports.bench, sent_frames(ports)
-        for k in range(50):
-            bench.advance(10 * NS_PER_MS + k * EVERY)
-            for board in (1, 3):
-                bench.boards[board].write(b"C05|%d|0|1|0\r" % (board + 1))
-        bench.advance(10 * NS_PER_MS + 50 * EVERY)
+        frames = sent_frames(ports)
+        writes = [(10 + 70 * k, board, b"C05|%d|0|1|0\r" % (board + 1)) for k in range(50) for board in (1, 3)]
+        played(*writes, until_ms=10 + 70 * 50, ports=ports)
         good = sum(len(said(ports, board, b"R05")) for board in (1, 3))
         shares[distance_m] = good / sum(isinstance(f.payload, RangeCommand) for f in frames)
     assert shares[900.0] == 1

@@ -24,20 +24,20 @@ def test_ranges_without_stamps_are_those_of_a_table_without_stamps(tmp_path):
     )
     for name in COLUMNS:
         np.testing.assert_array_equal(getattr(mine, name), getattr(table, name), err_msg=name)
-    cases: tuple[tuple[dict[str, Any], str], ...] = (({"tx1": [3]}, "rx1"), ({"rx1": [3]}, "tx1"))
-    for stamps, missing in cases:
-        with pytest.raises(ArgumentError, match=f"{missing}: is missing"):
-            Exchanges.from_arrays(1, 2, **stamps, range_m=[3.1])
-    with pytest.raises(ArgumentError, match="tx1: is missing; give the stamps, or range_m"):
-        Exchanges.from_arrays(1, 2)
+    cases: tuple[tuple[dict[str, Any], str], ...] = (
+        ({"tx1": [3], "range_m": [3.1]}, "rx1: is not given"),
+        ({"rx1": [3], "range_m": [3.1]}, "tx1: is not given"),
+        ({}, "tx1: is not given; give the stamps, or range_m"),
+    )
+    for columns, said in cases:
+        with pytest.raises(ArgumentError, match=said):
+            Exchanges.from_arrays(1, 2, **columns)
 
 
 def test_one_value_stands_for_all_rows_and_floats_of_whole_numbers_will_do():
     floats: Any = {k: np.array(v, dtype=float) for k, v in DS.items()}
     x = Exchanges.from_arrays(1, 2, **floats, protocol="ds-alt")
-    assert x.target.tolist() == [2, 2]
-    assert x.tx3.dtype == np.int64
-    assert set(x.protocol.tolist()) == {"ds-alt"}
+    assert (x.target.tolist(), x.protocol.tolist(), str(x.tx3.dtype)) == ([2, 2], ["ds-alt"] * 2, "int64")
 
 
 def test_stamps_that_a_protocol_has_not_are_zero_and_mixed_protocols_keep_theirs():
@@ -71,11 +71,10 @@ def test_stamps_that_a_protocol_has_not_are_zero_and_mixed_protocols_keep_theirs
     ],
 )  # fmt: skip
 def test_mistakes_name_column_row_and_what_is_expected(change, expected):
-    with pytest.raises(ArgumentError, match=expected) as caught:
+    assert issubclass(ArgumentError, ValueError)
+    assert issubclass(ArgumentError, UwblinkError)
+    with pytest.raises(ArgumentError, match=rf"\A.*({expected}).*\Z"):
         Exchanges.from_arrays(**({"initiator": 1, "target": [2, 3]} | SS | change))
-    assert isinstance(caught.value, ValueError)
-    assert isinstance(caught.value, UwblinkError)
-    assert "\n" not in str(caught.value)
 
 
 def test_exchanges_are_made_by_name_only():
@@ -97,9 +96,7 @@ def test_what_is_printed_fits_on_a_screen(count):
     poses = Poses.from_arrays(np.arange(count) + 2**60, "\x1b[31m" + "long" * 30, (1 / 3, -2 / 3, 1e-9))
     for thing in (x, poses):
         lines = repr(thing).splitlines()
-        assert len(lines) <= 12
-        assert max(map(len, lines)) <= 79
-        assert str(count) in lines[0]
+        assert (len(lines) <= 12, max(map(len, lines)) <= 79, str(count) in lines[0]) == (True, True, True), lines
         assert "\x1b" not in repr(thing) + thing._repr_html_()
     assert ("..." in repr(x)) == (count > 6)
     assert len(x._repr_html_()) < 6000

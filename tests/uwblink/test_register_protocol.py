@@ -66,16 +66,13 @@ def test_the_projects_own_rows_pass_their_own_check(name):
     check_protocol(PROTOCOLS[name])
 
 
-def test_skew_and_delays_go_through_the_registered_formula():
-    register_protocol(TARGETS)
-    try:
-        e = exchange("targets-clock", 1000, 20_000_000, 98_320_384, 7, -4)
-        # Six stamps cut to whole ticks, weighted by up to 1.2, halved.
-        assert time_of_flight(e)[0] / TICK_S == pytest.approx(1000, abs=2.5)
-        moved = (time_of_flight(replace(e, rx1=e.rx1 + 4000)) - time_of_flight(e))[0] / TICK_S
-        assert moved == pytest.approx(4000 * delay_weights(e)[1][0], abs=1e-3)
-    finally:
-        PROTOCOLS.remove("targets-clock")
+@pytest.mark.parametrize("registered", [TARGETS], indirect=True)
+def test_skew_and_delays_go_through_the_registered_formula(registered):
+    e = exchange(registered.name, 1000, 20_000_000, 98_320_384, 7, -4)
+    # Six stamps cut to whole ticks, weighted by up to 1.2, halved.
+    assert time_of_flight(e)[0] / TICK_S == pytest.approx(1000, abs=2.5)
+    moved = (time_of_flight(replace(e, rx1=e.rx1 + 4000)) - time_of_flight(e))[0] / TICK_S
+    assert moved == pytest.approx(4000 * delay_weights(e)[1][0], abs=1e-3)
 
 
 def test_a_mixture_of_protocols_keeps_each_to_its_own_formula(registered):
@@ -149,9 +146,8 @@ def backwards(t):
     ],
 )  # fmt: skip
 def test_what_cannot_work_is_refused_in_one_line(change, expected):
-    with pytest.raises(ArgumentError, match=expected) as caught:
+    with pytest.raises(ArgumentError, match=rf"\A.*({expected}).*\Z"):
         register_protocol(replace(SYMMETRIC, **change))
-    assert "\n" not in str(caught.value)
     assert SYMMETRIC.name not in PROTOCOLS
 
 

@@ -13,6 +13,7 @@ from uwblink.errors import ArgumentError
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S, elapsed
 from uwblink.twr import (
+    STAMPS,
     Exchanges,
     board_range,
     delay_weights,
@@ -38,15 +39,11 @@ def exchange(protocol, flight, reply, third, gamma_i, gamma_j, start=0, bits=32)
         left = true["tx2" if sender == "target" else "rx2"] + third
         true |= {"tx3": left, "rx3": left + flight}
     own = initiator_stamps(protocol)
-    stamps = {}
-    for name in ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3"):
-        if name not in true:
-            stamps[name] = np.array([0])
-            continue
-        rate = 1 + Fraction(gamma_i if name in own else gamma_j) / 10**6
-        offset = start if name in own else 7 * start + 12345
-        stamps[name] = np.array([int(offset + rate * Fraction(true[name])) % 2**bits])
     rates = [1 + Fraction(gamma, 10**6) for gamma in (gamma_i, gamma_j)]
+    stamps = dict.fromkeys(STAMPS, np.array([0]))
+    for name, when in true.items():
+        rate, offset = (rates[0], start) if name in own else (rates[1], 7 * start + 12345)
+        stamps[name] = np.array([int(offset + rate * Fraction(when)) % 2**bits])
     skew2_ppm = [float(rates[0] / rates[1] - 1) * 1e6]
     return Exchanges.from_arrays([1], [2], **stamps, protocol=protocol, skew2_ppm=skew2_ppm, range_m=np.nan, bits=bits)
 
@@ -90,14 +87,9 @@ def test_the_carrier_takes_the_skew_out():
 @pytest.mark.parametrize("kind", ["tx", "rx"])
 def test_a_delay_on_one_side_only_is_taken_out_by_its_weight(protocol, side, kind):
     clean = exchange(protocol, 1000, 20_000_000, 98_320_384, 3, -2)
-    d = 4000
-    own = initiator_stamps(protocol)
-    touched = {
-        name: getattr(clean, name) + d
-        for name in ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
-        if name[:2] == kind and (name in own) == (side == "initiator")
-    }
-    delayed = replace(clean, **touched)
+    d, own = 4000, initiator_stamps(protocol)
+    touched = [name for name in STAMPS if name[:2] == kind and (name in own) == (side == "initiator")]
+    delayed = replace(clean, **{name: getattr(clean, name) + d for name in touched})
     aggregate = d if kind == "tx" else -d  # d = d_t - d_r
     weights = dict(zip(("initiator", "target"), delay_weights(delayed), strict=True))
     corrected = time_of_flight(delayed)[0] / TICK_S + weights[side][0] * aggregate
@@ -166,14 +158,11 @@ def test_the_time_of_a_range_is_that_of_the_distance_it_measures(protocol, after
     def arrival(sent):
         return sent + (start + speed * sent) / (SPEED_OF_LIGHT - speed)
 
-    times = [0.0]
-    times.append(arrival(times[0]))
-    times.append(times[1] + reply)
-    times.append(arrival(times[2]))
-    of_target = PROTOCOLS[protocol].third_sender == "target"
-    if PROTOCOLS[protocol].third_sender:
-        times.append((times[2] if of_target else times[3]) + third)
-        times.append(arrival(times[4]))
+    times = [0.0, arrival(0.0), arrival(0.0) + reply, arrival(arrival(0.0) + reply)]
+    sender = PROTOCOLS[protocol].third_sender
+    if sender:
+        sent = times[2 if sender == "target" else 3] + third
+        times += [sent, arrival(sent)]
     ticks = [round(t / TICK_S) for t in times] + [0] * (6 - len(times))
     stamps = {name: [stamp] for name, stamp in zip(("tx1", "rx1", "tx2", "rx2", "tx3", "rx3"), ticks, strict=True)}
     x = Exchanges.from_arrays([1], [2], protocol=protocol, bits=40, **stamps)

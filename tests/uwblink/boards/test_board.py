@@ -51,9 +51,9 @@ def test_a_broadcast_is_not_sent_twice():
 
 def test_only_a_board_that_answers_nothing_for_a_second_is_called_dead():
     deaf = Deaf(1e9, ANSWERS)
-    with pytest.raises(NoAnswerError, match=r"b'C01.* within 150 ms; heard nothing; then no answer.*1000 ms") as caught:
+    said = r"b'C01.* within 150 ms; heard nothing; then no answer.*1000 ms.*must be unplugged\Z"
+    with pytest.raises(NoAnswerError, match=said):
         _ = Board(deaf).id
-    assert str(caught.value).endswith("must be unplugged")
     assert deaf.time_s == pytest.approx(1.15)
 
 
@@ -63,9 +63,8 @@ def test_the_answer_to_the_second_asking_may_fail_too():
             data = super().read(timeout_s)
             return data if data == b"R00\r\n" else b""
 
-    board = Board(Once(0.0, ANSWERS))
     with pytest.raises(NoAnswerError, match="b'C01"):
-        board.request(m.GetId())
+        Board(Once(0.0, ANSWERS)).request(m.GetId())
 
 
 # The driver's side of a conversation, without ports: outcomes, late replies, fences, times, what may be sent.
@@ -75,7 +74,6 @@ REPORT = (
     b"R05|2|3.0550|2334148660|1211574983|1233803316|2356378373|1332123700|2454699099"
     b"|-87.4977|-87.5239|-3.4971|3.5222\r\n"
 )
-OTHER = REPORT.replace(b"R05|2|", b"R05|3|")
 
 
 def asked(command=None):
@@ -101,12 +99,10 @@ CIR = encode(m.Cir(1, 2, 747_015, tuple(range(1016))))
 
 def test_a_patient_connection_stays_patient():
     connection = Connection("port", answer_s=2.0)
-    connection.send(FENCE, 0.0)
-    assert connection.deadline_s() == 2.0
-    connection.receive(b"", 2.0)
-    connection.send(FENCE, 3.0)
-    assert connection.deadline_s() == 5.0
-    connection.receive(b"R00\r\n", 3.1)
+    for sent_s, heard, heard_s in ((0.0, b"", 2.0), (3.0, b"R00\r\n", 3.1)):
+        connection.send(FENCE, sent_s)
+        assert connection.deadline_s() == sent_s + 2.0
+        connection.receive(heard, heard_s)
     assert not connection.doubtful
 
 
@@ -115,8 +111,7 @@ def test_the_last_60_bytes_are_quoted():
     connection.receive(b"\xff" + b"a" * 40, 0.01)
     connection.receive(b"b" * 21, 0.02)
     error = connection.receive(b"", 1.0)[1].error
-    assert isinstance(error, NoAnswerError)
-    assert str(error).endswith("heard '" + "a" * 39 + "b" * 21 + "'")
+    assert (type(error), str(error).partition("heard ")[2]) == (NoAnswerError, f"'{'a' * 39}{'b' * 21}'")
 
 
 def test_only_an_impulse_response_that_was_asked_for_keeps_the_board_quiet():
@@ -148,10 +143,11 @@ def test_what_failed_is_named_and_each_line_quoted_once(command, what):
 
 def test_a_report_answers_only_who_asked_for_that_target_and_that_protocol():
     single = REPORT.replace(b"|1332123700|2454699099|", b"|0|0|")
-    connection = asked(m.RangeCommand(2, double_sided=False))
-    assert connection.receive(OTHER.replace(b"|1332123700|2454699099|", b"|0|0|"), 0.01)[1] is None
-    assert connection.receive(single, 0.02)[1].reply.tx3 == 0
-    both = asked(m.RangeCommand(2))
-    assert both.receive(single, 0.01)[1] is None
-    assert both.receive(REPORT, 0.02)[1].reply.tx3 != 0
+    for double_sided, not_asked, answer in (
+        (False, single.replace(b"R05|2|", b"R05|3|"), single),
+        (True, single, REPORT),
+    ):
+        connection = asked(m.RangeCommand(2, double_sided=double_sided))
+        assert connection.receive(not_asked, 0.01)[1] is None
+        assert (connection.receive(answer, 0.02)[1].reply.tx3 != 0) == double_sided
     assert asked(m.GetId()).receive(REPORT, 0.01)[1] is None

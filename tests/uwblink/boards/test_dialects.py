@@ -17,6 +17,7 @@ from uwblink.boards import DIALECTS, Dialect, LivePage, PrintedRange, dialect_of
 from uwblink.boards.dialects import Printed
 from uwblink.boards.ports import Terminal
 from uwblink.errors import ArgumentError, ImportTableError, PlanError
+from uwblink.importers import read_source
 from uwblink.importers.devices import LINES
 
 # What each board prints for a range of one metre to one device and of two metres to another; made from descriptions.
@@ -61,62 +62,47 @@ def printing(text, *, asked=b"", banner=""):
         terminal.unplug()
 
 
+def by_log(tmp_path, text, map_text):
+    """Return the exchanges of an import of a log by a map with this text."""
+    (tmp_path / "board.log").write_text(text)
+    (tmp_path / "m.toml").write_text(map_text)
+    return read_source(tmp_path / "board.log", importer="csv", map_file=tmp_path / "m.toml").exchanges
+
+
 @pytest.mark.parametrize("name", FORMS)
 def test_what_a_board_prints_is_recorded(tmp_path, name):
     text, devices = FORMS[name]
     start = DIALECTS[name].start
     with printing(text, asked=start, banner="\r\n DWM1001 TWR Real Time Location System\r\n\r\ndwm> \r\n") as port:
-        done = succeed(
-            "uwblink",
-            "record",
-            port,
-            "--dialect",
-            name,
-            "--ids",
-            "40",
-            "--duration",
-            "1.5",
-            "-o",
-            "r.uwb",
-            cwd=tmp_path,
-        )
-    assert "ranges of" in done.stdout
+        words = ("--dialect", name, "--ids", "40", "--duration", "1.5", "-o", "r.uwb")
+        assert "ranges of" in succeed("uwblink", "record", port, *words, cwd=tmp_path).stdout
     found = uwblink.load(tmp_path / "r.uwb")
-    names = {tag.tag: tag.body for tag in found.tags}
-    ends = found.exchanges.target
-    called = {names[k] if isinstance(devices[0], str) else k for k in ends.tolist()}
-    assert (called, set(found.exchanges.range_m.round(9).tolist())) == (set(devices), {1.0, 2.0})
-    # The import of the same lines as a log, which another program reads (DuckDB), says the same.
-    (tmp_path / "board.log").write_text(text * 3)
-    constant = "" if "from_id" in LINES[name]["line"] else "[constants]\nfrom_id = 40\n"
-    (tmp_path / "m.toml").write_text(f'line = "{name}"\n{constant}')
-    uwblink.import_recording(tmp_path / "board.log", tmp_path / "log.uwb", importer="csv", map_file=tmp_path / "m.toml")
-    logged = uwblink.load(tmp_path / "log.uwb").exchanges
-    for column in ("initiator", "range_m"):
-        assert {*getattr(logged, column).tolist()} == {*getattr(found.exchanges, column).tolist()}
-    first = [k for k in names if names[k] == devices[0]] if isinstance(devices[0], str) else [devices[0]]
-    assert (found.exchanges.range_m[ends == first[0]] == 1.0).all()
+    e, names = found.exchanges, {tag.tag: tag.body for tag in found.tags}
+    called = [names[k] if isinstance(devices[0], str) else k for k in e.target.tolist()]
     # Lines of these forms say who ranged; of the others it is the board at the port.
-    assert set(found.exchanges.initiator.tolist()) == {7 if name in ("at-range", "trek-corrected") else 40}
-    assert len(found.exchanges) >= 10
+    own = 7 if name in ("at-range", "trek-corrected") else 40
+    told = {*zip(e.initiator.tolist(), called, e.range_m.round(9).tolist(), strict=True)}
+    assert told == {(own, devices[0], 1.0), (own, devices[1], 2.0)}
+    # The import of the same lines as a log, which another program reads (DuckDB), says the same.
+    constant = "" if "from_id" in LINES[name]["line"] else "[constants]\nfrom_id = 40\n"
+    logged = by_log(tmp_path, text * 3, f'line = "{name}"\n{constant}')
+    for column in ("initiator", "range_m"):
+        assert {*getattr(logged, column).tolist()} == {*getattr(e, column).tolist()}
+    assert (len(e) >= 10, found.meta["dialect"]) == (True, name)
     if name == "arduino":
-        assert set(found.exchanges.fpp2_dbm.tolist()) == {-78.5, -80.0}
-    assert found.meta["dialect"] == name
+        assert set(e.fpp2_dbm.tolist()) == {-78.5, -80.0}
     # The time is the host's.
-    assert abs(found.exchanges.time_ns[0] * 1e-9 - time.time()) < 120
-    assert np.all(np.diff(found.exchanges.time_ns) >= 0)
+    assert abs(e.time_ns[0] * 1e-9 - time.time()) < 120
+    assert np.all(np.diff(e.time_ns) >= 0)
 
 
 def test_a_map_of_lines_serves_as_for_logs_and_a_stream_is_corrected(tmp_path):
-    (tmp_path / "m.toml").write_text('line = "{from_id}->{to_id}: {range_m} ({rxp2})"\n[units]\ndistance = "cm"\n')
+    keys = 'line = "{from_id}->{to_id}: {range_m} ({rxp2})"\n[units]\ndistance = "cm"\n'
+    assert set(by_log(tmp_path, "1->2: 150 (-80.5)\n" * 5, keys).range_m.tolist()) == {1.5}
     calibrated(tmp_path, 1, 2)
-    (tmp_path / "board.log").write_text("1->2: 150 (-80.5)\n" * 5)
-    uwblink.import_recording(tmp_path / "board.log", tmp_path / "log.uwb", importer="csv", map_file=tmp_path / "m.toml")
-    assert set(uwblink.load(tmp_path / "log.uwb").exchanges.range_m.tolist()) == {1.5}
     with printing("1->2: 150 (-80.5)\n") as port:
-        done = succeed(
-            *("uwblink", "stream", port, "--dialect", "m.toml", "-c", "c.json", "--duration", "1.0"), cwd=tmp_path
-        )
+        words = ("--dialect", "m.toml", "-c", "c.json", "--duration", "1.0")
+        done = succeed("uwblink", "stream", port, *words, cwd=tmp_path)
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(rows) >= 5
     assert {(row["initiator"], row["target"], row["range_m"]) for row in rows} == {(1, 2, 1.5)}
@@ -126,19 +112,16 @@ def test_a_map_of_lines_serves_as_for_logs_and_a_stream_is_corrected(tmp_path):
 def test_a_map_means_for_boards_what_it_means_for_their_log(tmp_path):
     """Units of a place, a constant initiator, numbers of words, values without a range, and the sign of powers."""
     keys = 'line = "{to_id} {range_mm} {rxp2}"\nmissing = [65535]\n[units]\npower = "-dBm"\n[constants]\nfrom_id = 9\n'
-    (tmp_path / "m.toml").write_text(f"{keys}[ids]\nleft = 40\nright = 41\n")
     lines = "left 1500 80.5\nright 2500 81.5\nright 65535 99.0\n"
-    (tmp_path / "board.log").write_text(lines)
-    uwblink.import_recording(tmp_path / "board.log", tmp_path / "log.uwb", importer="csv", map_file=tmp_path / "m.toml")
+    logged = by_log(tmp_path, lines, f"{keys}[ids]\nleft = 40\nright = 41\n")
     with printing(lines) as port:
         words = ("--dialect", "m.toml", "--duration", "1.0", "-o", "r.uwb")
         succeed("uwblink", "record", port, *words, cwd=tmp_path)
-    told = []
-    for name in ("log.uwb", "r.uwb"):
-        x = uwblink.load(tmp_path / name).exchanges
-        told.append({*zip(x.initiator.tolist(), x.target.tolist(), x.range_m.round(6).tolist(), strict=True)})
-    assert (told[0], told[1]) == ({(9, 40, 1.5), (9, 41, 2.5)}, told[0])
-    assert set(uwblink.load(tmp_path / "r.uwb").exchanges.fpp2_dbm.tolist()) == {-80.5, -81.5}
+    recorded = uwblink.load(tmp_path / "r.uwb").exchanges
+    for x in (logged, recorded):
+        told = {*zip(x.initiator.tolist(), x.target.tolist(), x.range_m.round(6).tolist(), strict=True)}
+        assert told == {(9, 40, 1.5), (9, 41, 2.5)}
+    assert set(recorded.fpp2_dbm.tolist()) == {-80.5, -81.5}
     (tmp_path / "by_register.toml").write_text(
         'line = "{to_id} {range_m} {a} {b} {c} {n}"\nchip = "dw1000"\n[columns]\n'
         'fpp2 = { f1 = "a", f2 = "b", f3 = "c", n = "n" }\n'
@@ -155,11 +138,14 @@ def test_a_map_means_for_boards_what_it_means_for_their_log(tmp_path):
 
 def test_another_form_ends_with_a_line_and_no_file(tmp_path):
     with printing("hello 1\r\n" * 20) as port:
-        words = ("uwblink", "record", port, "--duration", "30", "-o", "r.uwb")
-        refuse(*words, "--dialect", "arduino", cwd=tmp_path, naming=[port, "no range in", "hello 1", "dialect"])
-        refuse(*words, "--dialect", "nonsense", cwd=tmp_path, naming=["--dialect", "dwm1001-lec"])
-        refuse(*words, "--dialect", "arduino", "--pairs", "all", cwd=tmp_path, naming=["--pairs", "--dialect"])
-        refuse(*words, "--dialect", "arduino", "--ids", "1,2", cwd=tmp_path, naming=["1 ports, but 2 ids"])
+        for words, naming in (
+            ("--dialect arduino", [port, "no range in", "hello 1", "dialect"]),
+            ("--dialect nonsense", ["--dialect", "dwm1001-lec"]),
+            ("--dialect arduino --pairs all", ["--pairs", "--dialect"]),
+            ("--dialect arduino --ids 1,2", ["1 ports and 2 ids"]),
+        ):
+            record = ("uwblink", "record", port, "--duration", "30", "-o", "r.uwb")
+            refuse(*record, *words.split(), cwd=tmp_path, naming=naming)
     # It is the only device that answers: of others, what was recorded would be kept.
     with printing(BOTH.splitlines(keepends=True)[0]) as port:
         same = ("uwblink", "record", port, "--duration", "30", "-o", "r.uwb", "--dialect", "arduino")
@@ -234,11 +220,7 @@ def test_the_page_shows_printed_ranges_and_their_corrections(tmp_path):
         done = uwblink.boards.record_printed([port], tmp_path / "r.uwb", dialect_of("arduino"), **how)
         body = page.body()
     assert f"{done.exchanges} ranges of 2 devices" in str(done)
-    for text in (
-        "40&nbsp;&rarr;&nbsp;6018",
-        "<td>1.000</td><td>0.750</td>",
-        "polyline class='corrected'".replace("'", '"'),
-    ):
+    for text in ("40&nbsp;&rarr;&nbsp;6018", "<td>1.000</td><td>0.750</td>", 'polyline class="corrected"'):
         assert text in body
     # No share of exchanges succeeded: of those that failed nothing is printed.
     assert "%" not in body
@@ -254,21 +236,13 @@ def test_a_stream_is_recorded_as_well_and_the_command_serves_the_page(tmp_path):
         words = ("--dialect", "arduino", "--ids", "40", "-c", "c.json", "--duration", "1.5", "-o")
         streamed = succeed("uwblink", "stream", port, *words, "s.uwb", cwd=tmp_path)
         recorded = succeed("uwblink", "record", port, *words, "r.uwb", "--live", cwd=tmp_path)
-        refuse("uwblink", "record", port, *words, "q.uwb", cwd=tmp_path, naming=["--calibration", "--live"])
-        refuse("uwblink", "stream", port, "--ids", "40", cwd=tmp_path, naming=["--ids", "--dialect"])
-        refuse("uwblink", "stream", "r.uwb", "--dialect", "arduino", cwd=tmp_path, naming=["r.uwb", "--dialect"])
-        refuse(
-            "uwblink",
-            "record",
-            port,
-            *words[:2],
-            "--ids",
-            "a",
-            "-o",
-            "q.uwb",
-            cwd=tmp_path,
-            naming=["--ids: found 'a'"],
-        )
+        for wrong, naming in (
+            (("record", port, *words, "q.uwb"), ["--calibration", "--live"]),
+            (("record", port, "--dialect", "arduino", "--ids", "a", "-o", "q.uwb"), ["--ids: found 'a'"]),
+            (("stream", port, "--ids", "40"), ["--ids", "--dialect"]),
+            (("stream", "r.uwb", "--dialect", "arduino"), ["r.uwb", "--dialect"]),
+        ):
+            refuse("uwblink", *wrong, cwd=tmp_path, naming=naming)
     rows = [json.loads(line) for line in streamed.stdout.splitlines()]
     found = uwblink.load(tmp_path / "s.uwb").exchanges
     assert len(found) == len(rows) >= 5

@@ -10,34 +10,33 @@ import pytest
 
 import uwblink
 from benchmarks.hours import RATE_HZ, AnsweringPorts
-from tests.boards import bench_scenario
+from tests.boards import bench_scenario, record_bench
 from uwblink import Listener, RangingPlan
 from uwblink.boards import record as writing
+from uwblink.boards.listeners import CallbackListener
 from uwblink.boards.record import RecordingWriter, append_rows, identify, record
 from uwblink.boards.recorder import Recorder
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import FrameRow
+from uwblink.recording.store import Store
 from uwblink.wire.messages import RangeReport
 from uwbsim.boards.virtual_board import VirtualPorts
 
 
-def recorded(path, ports, *listeners, seconds=4.0, **more):
-    plan = uwblink.RangingPlan(rate_hz=50.0)
-    names = list(ports.names.values())
-    return uwblink.record(names, path, plan, duration_s=seconds, listeners=listeners, using=ports, **more)
+def recorded(path, *listeners, ports=None, seconds=4.0):
+    return record_bench(path, None, ports, duration_s=seconds, listeners=listeners)
 
 
 def test_a_function_hears_every_message_that_the_file_gets(tmp_path):
     heard: list[uwblink.Heard] = []
-    done = recorded(tmp_path / "f.uwb", VirtualPorts(bench_scenario()), heard.append)
+    done = recorded(tmp_path / "f.uwb", heard.append)
     reports = [h for h in heard if isinstance(h.message, RangeReport)]
     # In virtual time at 50 Hz none is missing.
     assert len(reports) == done.exchanges == done.tried == pytest.approx(200, abs=1)
-    with Recording.open(tmp_path / "f.uwb") as recording:
-        exchanges = recording.exchanges()
-    assert [h.message.tx1 for h in reports] == exchanges.tx1.tolist()
-    assert [h.board for h in reports] == exchanges.initiator.tolist()
+    e = uwblink.load(tmp_path / "f.uwb").exchanges
+    told = [(h.board, h.message.tx1) for h in reports]
+    assert told == list(zip(e.initiator.tolist(), e.tx1.tolist(), strict=True))
 
 
 class Everything(uwblink.Listener):
@@ -56,56 +55,50 @@ class Everything(uwblink.Listener):
 
 def test_a_listener_is_told_bytes_turns_and_faults(tmp_path):
     ports, listener = VirtualPorts(bench_scenario(), lost_share=0.4), Everything()
-    done = recorded(tmp_path / "f.uwb", ports, listener, seconds=2.0)
-    assert len(listener.turns) == done.tried
-    assert sum(t.report is not None for t in listener.turns) == done.exchanges < done.tried
-    with Recording.open(tmp_path / "f.uwb") as recording:
-        assert [f.detail for f in listener.faults] == [f.detail for f in recording.faults()]
-        for way in ("in", "out"):
-            assert listener.bytes[way] == b"".join(f.data for f in recording.frames() if f.direction == way)
+    done = recorded(tmp_path / "f.uwb", listener, ports=ports, seconds=2.0)
+    good = sum(turn.report is not None for turn in listener.turns)
+    assert good == done.exchanges < done.tried == len(listener.turns)
+    found = uwblink.load(tmp_path / "f.uwb")
+    assert [f.detail for f in listener.faults] == [f.detail for f in found.faults]
+    for way in ("in", "out"):
+        assert listener.bytes[way] == b"".join(f.data for f in found.frames if f.direction == way)
 
 
 def test_a_listener_that_raises_ends_the_recording_with_everything_before_in_the_file(tmp_path):
-    count = 0
+    left = iter(range(19))
 
     def fail(heard):
-        nonlocal count
-        count += isinstance(heard.message, RangeReport)
-        if count == 20:
+        if isinstance(heard.message, RangeReport) and next(left, None) is None:
             raise ZeroDivisionError("a mistake of the user's")
 
     with pytest.raises(ZeroDivisionError):
-        recorded(tmp_path / "f.uwb", VirtualPorts(bench_scenario()), fail)
-    with Recording.open(tmp_path / "f.uwb") as recording:
-        assert len(recording.exchanges()) == 20
+        recorded(tmp_path / "f.uwb", fail)
+    assert len(uwblink.load(tmp_path / "f.uwb").exchanges) == 20
 
 
 def test_a_recorder_needs_no_file(tmp_path):
     ports = VirtualPorts(bench_scenario())
     heard: list[uwblink.Heard] = []
     found = identify(ports.names.values(), ports)
-    recorder = Recorder(found, uwblink.RangingPlan(), [(1, 2)], [as_listener(heard)], ports=ports)
+    recorder = Recorder(found, uwblink.RangingPlan(), [(1, 2)], [CallbackListener(heard.append)], ports=ports)
     recorder.run(0.5)
     recorder.close()
     assert recorder.progress.exchanges == sum(isinstance(h.message, RangeReport) for h in heard) > 100
 
 
-def as_listener(heard):
-    from uwblink.boards.listeners import CallbackListener
-
-    return CallbackListener(heard.append)
-
-
-def test_what_is_no_listener_is_refused(tmp_path):
-    with pytest.raises(TypeError, match="listeners: found 3, expected a Listener or a function"):
-        recorded(tmp_path / "f.uwb", VirtualPorts(bench_scenario()), 3)
+@pytest.mark.parametrize(
+    ("listeners", "seconds", "error", "said"),
+    [
+        ([3], 4.0, TypeError, "listeners: found 3, expected a Listener or a function"),
+        ([], 0.0, uwblink.UwblinkError, "duration_s"),
+        ([], -1.0, uwblink.UwblinkError, "duration_s"),
+        ([], float("nan"), uwblink.UwblinkError, "duration_s"),
+    ],
+)
+def test_listeners_and_durations_that_are_none_are_refused(tmp_path, listeners, seconds, error, said):
+    with pytest.raises(error, match=said):
+        recorded(tmp_path / "f.uwb", *listeners, seconds=seconds)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_durations_that_are_none_are_refused(tmp_path):
-    for wrong in (0.0, -1.0, float("nan")):
-        with pytest.raises(uwblink.UwblinkError, match="duration_s"):
-            recorded(tmp_path / "f.uwb", VirtualPorts(bench_scenario()), seconds=wrong)
 
 
 def damaged(ports, hit):
@@ -125,15 +118,13 @@ def test_one_damaged_line_is_one_fault(tmp_path):
     def hit(data):
         # The fifth piece of each response; bars inside it are places where nothing starts.
         seen.append(data)
-        in_response = data.startswith(b"|")
-        number = sum(1 for d in reversed(seen) if d.startswith((b"|", b"S10"))) if in_response else 0
-        return data[:10] + b"x" + data[11:] if in_response and number % 21 == 5 else data
+        number = sum(d.startswith((b"|", b"S10")) for d in seen)
+        return data[:10] + b"x" + data[11:] if data.startswith(b"|") and number % 21 == 5 else data
 
     damaged(ports, hit)
     plan = uwblink.RangingPlan(pairs=((1, 2),), rate_hz=5.0, get_cir=True)
-    done = uwblink.record(ports.names.values(), tmp_path / "f.uwb", plan, duration_s=4.0, using=ports)
-    assert done.exchanges == done.tried == 20
-    assert done.faults == {"garbage": 20}
+    done = record_bench(tmp_path / "f.uwb", plan, ports, duration_s=4.0)
+    assert (done.exchanges, done.tried, done.faults) == (20, 20, {"garbage": 20})
 
 
 # The writer of a live recording: what cannot be written is known at the start, or within a second.
@@ -250,8 +241,6 @@ STATEMENTS: list[str] = []
 
 @pytest.fixture
 def statements(monkeypatch):
-    from uwblink.recording.store import Store
-
     execute = Store._execute
 
     def noted(store, statement, values=None):
@@ -292,7 +281,6 @@ def test_the_time_of_a_recording_is_that_of_its_boards(tmp_path):
     ports = AnsweringPorts()
     plan = RangingPlan(ports.pairs, rate_hz=RATE_HZ)
     done = record(ports.names, tmp_path / "r.uwb", plan, duration_s=3.0, using=ports)
-    with Recording.open(tmp_path / "r.uwb") as recording:
-        x = recording.exchanges()
-    assert len(x) == done.exchanges == pytest.approx(3.0 * RATE_HZ, abs=2)
+    count = len(uwblink.load(tmp_path / "r.uwb").exchanges)
+    assert count == done.exchanges == pytest.approx(3.0 * RATE_HZ, abs=2)
     assert not done.faults

@@ -14,8 +14,9 @@ import urllib.request
 import numpy as np
 import pytest
 
+import calib
 import uwblink
-from tests.boards import bench_scenario, served
+from tests.boards import bench_scenario, record_bench, served
 from tests.browser import chromium
 from tests.processes import BIN
 from uwblink.boards import live_page
@@ -27,8 +28,9 @@ from uwblink.wire.messages import RangeReport
 from uwbsim.boards.virtual_board import VirtualPorts
 
 
-def fetch(page, path="", **headers):
-    request = urllib.request.Request(page.url + path, headers=headers)  # noqa: S310 - the page's own address
+def fetch(page, path="", method="GET", **headers):
+    data = None if method == "GET" else b"C09\r"
+    request = urllib.request.Request(page.url + path, data, headers, method=method)  # noqa: S310 - its own address
     with urllib.request.urlopen(request, timeout=30) as answer:  # noqa: S310
         return answer.headers, answer.read().decode()
 
@@ -45,20 +47,11 @@ class Looking(uwblink.Listener):
             self.seen.append(self.look())
 
 
-def recorded(tmp_path, page, look, lost_share=0.1):
-    ports = VirtualPorts(bench_scenario(), lost_share)
-    looking = Looking(400, look)
-    plan = uwblink.RangingPlan(rate_hz=100.0)
-    done = uwblink.record(
-        ports.names.values(),
-        tmp_path / "f.uwb",
-        plan,
-        duration_s=5.0,
-        listeners=[page, looking],
-        using=ports,
-        watch=page.watch,
-    )
-    return done, looking.seen[0]
+def recorded(tmp_path, page, look):
+    ports = VirtualPorts(bench_scenario(), lost_share=0.1)
+    looking, plan = Looking(400, look), uwblink.RangingPlan(rate_hz=100.0)
+    how = {"duration_s": 5.0, "listeners": [page, looking], "watch": page.watch}
+    return record_bench(tmp_path / "f.uwb", plan, ports, **how), looking.seen[0]
 
 
 def corrected(exchanges):
@@ -101,9 +94,9 @@ def test_the_picture_is_the_last_minute(tmp_path):
     assert len(drawn) == 61
     assert across == pytest.approx([3 + 254 * k / 60 for k in range(61)], abs=0.06)
     assert down == pytest.approx([41 - 38 * k / 60 for k in range(61)], abs=0.06)
-    assert "range from 3.290 to 3.890 m" in text
-    assert "<small>3.29 to 3.89 m, 60 s</small>" in text
-    assert "class='silent'" in text, "the last range came six seconds ago"
+    # The last range came six seconds ago.
+    for words in ("range from 3.290 to 3.890 m", "<small>3.29 to 3.89 m, 60 s</small>", "class='silent'"):
+        assert words in text
     assert "corrected" not in text, "there is no calibration"
 
 
@@ -143,14 +136,14 @@ def test_an_unplugged_board_stays_named_until_it_is_back(tmp_path):
 
 
 def test_what_boards_say_cannot_become_part_of_the_page(tmp_path):
+    progress = Progress()
+    progress.on_fault(Fault(0, "1", "text", "<script>alert(1)</script>"))
     with LivePage(tmp_path / "<f>.uwb") as page:
-        progress = Progress()
-        progress.on_fault(Fault(0, "1", "text", "<script>alert(1)</script>"))
         page.watch(progress)
         _, text = fetch(page)
     assert "<script>alert" not in text
-    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
-    assert "recording &lt;f&gt;.uwb" in text
+    for words in ("&lt;script&gt;alert(1)&lt;/script&gt;", "recording &lt;f&gt;.uwb"):
+        assert words in text
 
 
 def test_the_page_is_for_this_computer_alone(tmp_path):
@@ -159,31 +152,30 @@ def test_the_page_is_for_this_computer_alone(tmp_path):
         headers, text = fetch(page)
         assert "default-src 'none'" in headers["Content-Security-Policy"]
         assert not re.findall(r"(?:src|href)=", text)
-        for path, host, status in (
-            ("", "evil.example", 403),
-            ("body", "evil.example:8000", 403),
-            ("", "127.0.0.1.evil.example", 403),
-            ("", "localhost.evil.example:80", 403),
-            ("", "", 403),
-            ("../etc/passwd", "localhost", 404),
-            ("x", "localhost", 404),
+        for path, host, method, status in (
+            ("", "evil.example", "GET", 403),
+            ("body", "evil.example:8000", "GET", 403),
+            ("", "127.0.0.1.evil.example", "GET", 403),
+            ("", "localhost.evil.example:80", "GET", 403),
+            ("", "", "GET", 403),
+            ("../etc/passwd", "localhost", "GET", 404),
+            ("x", "localhost", "GET", 404),
+            *(("", "localhost", method, 501) for method in ("POST", "PUT", "DELETE", "OPTIONS")),
         ):
             with pytest.raises(urllib.error.HTTPError) as refused:
-                fetch(page, path, Host=host)
+                fetch(page, path, method, Host=host)
+            refused.value.close()
             assert refused.value.code == status
-            refused.value.close()
-        for method in ("POST", "PUT", "DELETE", "OPTIONS"):
-            request = urllib.request.Request(page.url, data=b"C09\r", method=method)  # noqa: S310 - the page's own
-            with pytest.raises(urllib.error.HTTPError) as refused:
-                urllib.request.urlopen(request, timeout=30)  # noqa: S310
-            assert refused.value.code == 501
-            refused.value.close()
         with pytest.raises(PortError, match="cannot be served there"):
-            LivePage(tmp_path / "f.uwb", port=int(page.url.rsplit(":", 1)[1].rstrip("/")))
+            LivePage(tmp_path / "f.uwb", port=port_of(page))
+
+
+def port_of(page):
+    return int(page.url.rsplit(":", 1)[1].rstrip("/"))
 
 
 def connected(page):
-    return socket.create_connection(("127.0.0.1", int(page.url.rsplit(":", 1)[1].rstrip("/"))), timeout=20)
+    return socket.create_connection(("127.0.0.1", port_of(page)), timeout=20)
 
 
 def test_connections_that_are_reset_or_hold_garbage_print_nothing_and_end_nothing(tmp_path, capfd):
@@ -218,13 +210,11 @@ def test_what_a_page_fetches_names_the_recording_of_whoever_serves_it_now(tmp_pa
     """The next recorder may have the same port, and the page of the one before is still open."""
     with LivePage(tmp_path / "old.uwb") as page:
         _, whole = fetch(page)
-        port = int(page.url.rsplit(":", 1)[1].rstrip("/"))
-    with LivePage(tmp_path / "new.uwb", port=port) as page:
+    with LivePage(tmp_path / "new.uwb", port=port_of(page)) as page:
         _, body = fetch(page, "body")
-    assert "recording old.uwb" in whole[whole.index("<main>") : whole.index("</main>")]
-    assert "recording new.uwb" in body
-    outside = whole[: whole.index("<main>")].partition("</title>")[2] + whole[whole.index("</main>") :]
-    assert "old.uwb" not in outside, "what is not fetched again says nothing of a recording"
+    before, main, after = re.split("</?main>", whole.partition("</title>")[2])
+    assert ("recording old.uwb" in main, "recording new.uwb" in body) == (True, True)
+    assert "old.uwb" not in before + after, "what is not fetched again says nothing of a recording"
 
 
 def test_a_browser_shows_it_and_keeps_it_fresh(tmp_path):
@@ -243,14 +233,11 @@ def test_a_browser_shows_it_and_keeps_it_fresh(tmp_path):
 
         page.body = counted  # type: ignore[method-assign]
         _, done = recorded(tmp_path, page, look)
-    assert done.count("<polyline") >= 3
-    assert "recording f.uwb" in done
+    assert (done.count("<polyline") >= 3, "recording f.uwb" in done) == (True, True)
     assert len(bodies) >= 2, "the script fetches the body again"
 
 
 def test_a_calibration_s_correction_is_found_by_its_entry_point(tmp_path):
-    import calib
-
     flight = calib.sample_flight()
     calibration = calib.fit(flight).calibration
     (tmp_path / "c.json").write_text("{}")
@@ -277,7 +264,6 @@ def test_the_command_says_where_the_page_is_and_serves_it_while_it_records(tmp_p
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
     assert text.count("<polyline") == 3, "three pairs, without a calibration"
-    assert process.returncode == 0, err
-    assert " exchanges in " in out
+    assert (process.returncode, " exchanges in " in out) == (0, True), err
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(url, timeout=5)  # noqa: S310

@@ -17,7 +17,7 @@ import pytest
 
 import uwblink
 from tests import processes
-from tests.boards import bench_scenario, served
+from tests.boards import bench_scenario, record_bench, served
 from tests.processes import fork
 from uwblink import Listener, RangingPlan, Recording
 from uwblink.boards.listeners import Progress
@@ -44,8 +44,8 @@ class After(Listener):
 
 
 def exchanges_of(path):
-    with Recording.open(path) as recording:
-        return recording.exchanges(), [fault.kind for fault in recording.faults()]
+    found = uwblink.load(path)
+    return found.exchanges, [fault.kind for fault in found.faults]
 
 
 def test_an_hour_forward_and_back_on_the_wall_changes_no_time_in_the_file(tmp_path, monkeypatch):
@@ -57,11 +57,10 @@ def test_an_hour_forward_and_back_on_the_wall_changes_no_time_in_the_file(tmp_pa
     with served() as server:
         ports = list(server.names.values())
         record(ports, path, RangingPlan(), duration_s=60.0, listeners=[clock], stop=lambda: clock.turns > 60)
-    exchanges, _ = exchanges_of(path)
-    assert len(exchanges) > 50
-    times = np.sort(exchanges.time_ns)
+    time_ns = uwblink.load(path).exchanges.time_ns
+    assert len(time_ns) > 50
     # As long as the test took, and not an hour.
-    assert before - 10**9 < times[0] < times[-1] < plain() + 10**9
+    assert before - 10**9 < time_ns.min() < time_ns.max() < plain() + 10**9
 
 
 def test_host_time_goes_on_while_the_computer_is_suspended(monkeypatch):
@@ -89,17 +88,15 @@ class Suspended(VirtualPorts):
 
 
 def test_five_seconds_of_suspension_are_a_gap_and_nothing_else(tmp_path):
-    path, ports = tmp_path / "f.uwb", Suspended(bench_scenario())
-    done = record(ports.names.values(), path, RangingPlan(rate_hz=50.0), duration_s=8.0, using=ports)
-    exchanges, kinds = exchanges_of(path)
+    done = record_bench(tmp_path / "f.uwb", None, Suspended(bench_scenario()), duration_s=8.0)
+    exchanges, kinds = exchanges_of(tmp_path / "f.uwb")
     gaps = np.diff(np.sort(exchanges.time_ns)) * 1e-9
     assert 4.9 < gaps.max() < 5.2
     # No burst makes up for the gap. The exchange in which it fell may have failed, or its report waited all the while.
     assert len(exchanges) == pytest.approx(150, abs=5)
     assert np.median(gaps) == pytest.approx(0.02, rel=0.1)
     assert np.sort(gaps)[1] > 0.01
-    assert len(kinds) <= 1
-    assert done.tried - done.exchanges <= 1
+    assert max(len(kinds), done.tried - done.exchanges) <= 1
 
 
 @pytest.fixture
@@ -164,18 +161,17 @@ def test_a_folder_made_read_only_under_the_recorder_takes_nothing_away():
             folder.chmod(0o555)
             os.seteuid(NOBODY)
 
-        ports = VirtualPorts(bench_scenario())
+        after = After(t20=lock)
         os.seteuid(NOBODY)
         try:
-            after = After(t20=lock)
             with pytest.raises(RecordingError, match=r"any more \(.*Permission denied\).* everything before is kept"):
-                record(ports.names.values(), path, RangingPlan(), using=ports, duration_s=1.0, listeners=[after])
+                record_bench(path, RangingPlan(), duration_s=1.0, listeners=[after])
             exchanges, kinds = exchanges_of(path)
         finally:
             os.seteuid(0)
             folder.chmod(0o777)
-        assert len(exchanges) == after.turns > 200
-        assert kinds == []
+        assert (len(exchanges), kinds) == (after.turns, [])
+        assert after.turns > 200
 
 
 def test_two_recorders_cannot_have_one_file(tmp_path):
@@ -188,15 +184,13 @@ def test_two_recorders_cannot_have_one_file(tmp_path):
             found.extend(fork(*words, *force) for force in ((), ("--force",)))
         found.append(fork("uwblink", "import", "csv", "docs/examples/exchanges.csv", "-o", path, "--force"))
 
-    ports = VirtualPorts(bench_scenario())
-    record(ports.names.values(), path, RangingPlan(), duration_s=2.0, using=ports, listeners=[After(t20=second)])
+    record_bench(path, RangingPlan(), duration_s=2.0, listeners=[After(t20=second)])
     assert [ended.returncode for ended in found] == [2, 2, 2]
     assert "already exists" in found[0].stderr
     for ended in found[1:]:
         assert ended.stderr == f"error: {path}: another process is writing it; give another name\n"
     exchanges, kinds = exchanges_of(path)
-    assert len(exchanges) > 50
-    assert kinds == []
+    assert (len(exchanges) > 50, kinds) == (True, [])
 
 
 # What docs/security.md says of a device on the cable, held against devices that try otherwise.
@@ -261,15 +255,13 @@ def test_a_device_neither_steers_the_terminal_nor_ends_the_recorder_nor_writes_e
     assert not CONTROLS.search(done.stdout + done.stderr + shown.stdout + shown.stderr)
     assert [path.name for path in out.parent.iterdir()] == ["f.uwb"]
     assert max(map(len, got)) <= 64, "no command has more bytes than a USB packet"
-    with uwblink.Recording.open(out) as recording:
-        kinds, frames = {fault.kind for fault in recording.faults()}, recording.frames()
-    assert "garbage" in kinds
-    assert sum(frame.data.count(b"\x1b") for frame in frames) > 0, "every byte is kept"
+    held = uwblink.load(out)
+    assert "garbage" in {fault.kind for fault in held.faults}
+    assert any(b"\x1b" in frame.data for frame in held.frames), "every byte is kept"
 
 
-@pytest.mark.parametrize("words", [["test"], ["twr", "2"], ["cir", "2"]])
-def test_a_command_to_a_hostile_device_ends_in_a_line(tmp_path, words):
-    command, *rest = words
+@pytest.mark.parametrize(("command", "rest"), [("test", []), ("twr", ["2"]), ("cir", ["2"])])
+def test_a_command_to_a_hostile_device_ends_in_a_line(tmp_path, command, rest):
     with hostile(1, tmp_path / "tag1", SAID[:6]):
         done = processes.run("uwblink", command, tmp_path / "tag1", *rest, timeout=120)
     assert done.returncode in (0, 2)
@@ -335,9 +327,7 @@ def test_zeros_without_an_end_are_faults_and_no_memory():
         after, most = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert ports.said - said > 4e6
-    assert most < before + 300_000
-    assert after < before + 100_000
-    assert seen.faults["garbage"] > 100
-    assert len(seen.last_fault) < 300
     recorder.close()
+    assert ports.said - said > 4e6
+    assert (most < before + 300_000, after < before + 100_000) == (True, True), (before, most, after)
+    assert (seen.faults["garbage"] > 100, len(seen.last_fault) < 300) == (True, True), seen

@@ -2,7 +2,6 @@
 
 import errno
 import json
-import os
 import socket
 import threading
 
@@ -46,10 +45,7 @@ def test_permission_denied_names_the_group(tmp_path):
     (tmp_path / "port").write_text("")
     error = _explained(str(tmp_path / "port"), PermissionError(errno.EACCES, "Permission denied"))
     assert isinstance(error, PortPermissionError)
-    import grp
-
-    group = grp.getgrgid(os.stat(tmp_path / "port").st_gid).gr_name
-    assert f"join the group {group}" in str(error)
+    assert f"join the group {(tmp_path / 'port').group()}" in str(error)
 
 
 def test_a_second_opening_is_refused_and_a_lost_port_says_so():
@@ -73,11 +69,10 @@ def answerer():
         connection, _ = listening.accept()
         with connection:
             while data := connection.recv(100):
-                if data == b"C01\r":
-                    connection.sendall(b"R01|")
-                    connection.sendall(b"77\r\n")
                 if data == b"C07\r":
                     return
+                for piece in (b"R01|", b"77\r\n") if data == b"C01\r" else ():
+                    connection.sendall(piece)
 
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()
@@ -105,19 +100,14 @@ def test_bytes_from_before_the_opening_are_not_taken_for_answers():
 
 
 def written(tmp_path, text):
-    path = tmp_path / "plan.toml"
-    path.write_text(text)
-    return path
+    (tmp_path / "plan.toml").write_text(text)
+    return tmp_path / "plan.toml"
 
 
 def test_a_whole_plan(tmp_path):
-    plan = load_plan(
-        written(
-            tmp_path,
-            "pairs = [[1, 2], [3, 1]]\nrate_hz = 50\nprotocol = 'ss'\ntarget_reports = true\nget_cir = true\n"
-            "[[tags]]\nid = 1\nbody = 'a'\nlever_arm_m = [0.1, 0, -1]\n",
-        )
-    )
+    text = "pairs = [[1, 2], [3, 1]]\nrate_hz = 50\nprotocol = 'ss'\ntarget_reports = true\nget_cir = true\n"
+    seat = "[[tags]]\nid = 1\nbody = 'a'\nlever_arm_m = [0.1, 0, -1]\n"
+    plan = load_plan(written(tmp_path, text + seat))
     tags = (Tag(1, "a", (0.1, 0.0, -1.0)),)
     expected = RangingPlan(((1, 2), (3, 1)), rate_hz=50, protocol="ss", target_reports=True, get_cir=True, tags=tags)
     assert (plan, plan.turns([1, 2, 3])) == (expected, ((1, 2), (3, 1)))

@@ -5,17 +5,19 @@ import signal
 import subprocess
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.boards import bench_scenario, served
+from tests.boards import bench_scenario, record_bench, served
 from tests.processes import BIN
-from uwblink import RangingPlan, Recording, record
+from uwblink import RangingPlan, Recording, load, record
 from uwblink.boards import decode_again
 from uwblink.boards.listeners import Listener, Progress
 from uwblink.errors import PlanError, PortMissingError, RecordingError, RecordingExistsError
 from uwblink.recording.schema import Arrangement, FrameRow, Tag
+from uwblink.twr import raw_range
 from uwblink.wire.messages import IdReport, Skipped
 from uwbsim.boards.virtual_board import VirtualPorts
 
@@ -26,15 +28,12 @@ def stored(path):
 
 
 def test_an_arrangement_is_marked_from_beginning_to_end(tmp_path):
-    path, ports = tmp_path / "a.uwb", VirtualPorts(bench_scenario())
-    plan = RangingPlan(rate_hz=50.0)
-    record(ports.names.values(), path, plan, duration_s=1.0, using=ports, arrangement="A", known="plane")
-    with Recording.open(path) as recording:
+    record_bench(tmp_path / "a.uwb", duration_s=1.0, arrangement="A", known="plane")
+    with Recording.open(tmp_path / "a.uwb") as recording:
         (mark,) = recording.arrangements()
         time_ns = recording.exchanges().time_ns
     assert (mark.name, mark.known) == ("A", "plane")
-    assert mark.start_ns <= time_ns.min()
-    assert time_ns.max() < mark.end_ns < mark.start_ns + 1.2e9
+    assert mark.start_ns <= time_ns.min() < time_ns.max() < mark.end_ns < mark.start_ns + 1.2e9
 
 
 @pytest.mark.parametrize(
@@ -47,22 +46,22 @@ def test_an_arrangement_is_marked_from_beginning_to_end(tmp_path):
     ],
 )
 def test_what_cannot_be_known_of_an_arrangement_is_refused(tmp_path, given, named):
-    ports = VirtualPorts(bench_scenario())
     with pytest.raises(PlanError, match=named):
-        record(ports.names.values(), tmp_path / "a.uwb", RangingPlan(), using=ports, **given)
+        record_bench(tmp_path / "a.uwb", **given)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_plan_that_seats_other_boards_is_refused_before_anything_is_recorded(tmp_path):
-    ports, out = VirtualPorts(bench_scenario()), tmp_path / "a.uwb"
-    seats = [Tag(number, "drone", (0.1, 0.0, 0.0)) for number in (20, 10)]
+    others, own = (
+        RangingPlan(tags=tuple(Tag(number, "drone", (0.1, 0.0, 0.0)) for number in numbers))
+        for numbers in ((20, 10), (1,))
+    )
     with pytest.raises(
         PlanError, match="the plan has positions of the tags 10, 20, but the boards at the ports are 1, 2, 3"
     ):
-        record(ports.names.values(), out, RangingPlan(tags=tuple(seats)), duration_s=0.5, using=ports)
-    assert not out.exists()
-    some = RangingPlan(rate_hz=50.0, tags=(Tag(1, "drone", (0.1, 0.0, 0.0)),))
-    assert record(ports.names.values(), out, some, duration_s=0.2, using=ports).exchanges
+        record_bench(tmp_path / "a.uwb", others, duration_s=0.5)
+    assert not list(tmp_path.iterdir())
+    assert record_bench(tmp_path / "a.uwb", own, duration_s=0.2).exchanges
 
 
 @pytest.mark.parametrize("known", ["line 1 1", "plane 1 2", "line 1 b", "line  1"])
@@ -75,10 +74,9 @@ def test_an_order_that_is_none_is_one_line(tmp_path, known):
 
 def test_what_the_boards_said_is_in_the_file_and_decodes_to_the_same(tmp_path):
     path, ports = tmp_path / "f.uwb", VirtualPorts(bench_scenario())
-    done = record(ports.names.values(), path, RangingPlan(rate_hz=100.0), duration_s=1.5, using=ports)
+    done = record_bench(path, RangingPlan(rate_hz=100.0), ports, duration_s=1.5)
     exchanges, faults, frames, meta = stored(path)
-    assert len(exchanges) == done.exchanges == done.tried
-    assert 145 <= len(exchanges) <= 151
+    assert 145 <= len(exchanges) == done.exchanges == done.tried <= 151
     assert (faults, meta["ports"]) == ([], {str(k): ports.names[k] for k in ports.names})
     ends = set(zip(exchanges.initiator.tolist(), exchanges.target.tolist(), strict=True))
     assert (ends, sum(frame.direction == "out" for frame in frames)) == ({(1, 2), (1, 3), (2, 3)}, done.tried)
@@ -95,12 +93,11 @@ def test_what_the_boards_said_is_in_the_file_and_decodes_to_the_same(tmp_path):
 def test_overheard_exchanges_impulse_responses_and_target_reports(tmp_path):
     path, ports = tmp_path / "f.uwb", VirtualPorts(bench_scenario())
     plan = RangingPlan(((1, 2),), rate_hz=10.0, target_reports=True, get_cir=True)
-    done = record(ports.names.values(), path, plan, duration_s=2.0, passive=True, using=ports)
+    done = record_bench(path, plan, ports, duration_s=2.0, passive=True)
     assert not any(board.passive for board in ports.bench.boards.values()), "listening is switched off again"
     with Recording.open(path) as recording:
         # Each exchange of twenty is reported by both ends and heard by the third, each with its impulse response.
-        assert recording.count("overheard") == done.overheard == done.exchanges == done.tried
-        assert 19 <= done.tried <= 20
+        assert 19 <= recording.count("overheard") == done.overheard == done.exchanges == done.tried <= 20
         assert recording.count("cirs") == done.cirs == 3 * done.tried
         reporters = set(recording.exchanges().reporter.tolist())
     assert (reporters, done.faults) == ({1, 2}, {})
@@ -127,26 +124,16 @@ def test_an_unplugged_board_leaves_the_others_running_and_resumes(tmp_path):
     path = tmp_path / "f.uwb"
     with served(link_dir=tmp_path / "ports") as server:
         cable = Unplugging(server)
-        record(
-            server.names.values(),
-            path,
-            RangingPlan(rate_hz=100.0),
-            duration_s=60.0,
-            passive=True,
-            listeners=[cable],
-            stop=lambda: cable.back > 30,
-        )
-    exchanges, faults, _, _ = stored(path)
-    kinds = [fault.kind for fault in faults]
-    assert (kinds.count("unplugged"), kinds.count("replugged")) == (1, 1)
-    out, back = (next(f.time_ns for f in faults if f.kind == k) for k in ("unplugged", "replugged"))
-    others = exchanges.time_ns[(exchanges.initiator == 1) & (exchanges.target == 2)]
+        how: Any = {"duration_s": 60.0, "passive": True, "listeners": [cable], "stop": lambda: cable.back > 30}
+        record(server.names.values(), path, RangingPlan(rate_hz=100.0), **how)
+    found = load(path)
+    e, heard = found.exchanges, found.overheard
+    (out,), (back,) = ([f.time_ns for f in found.faults if f.kind == kind] for kind in ("unplugged", "replugged"))
+    others = e.time_ns[(e.initiator == 1) & (e.target == 2)]
     assert np.count_nonzero((others > out) & (others < back)) >= 15
-    assert np.any(exchanges.time_ns[(exchanges.initiator == 3) | (exchanges.target == 3)] > back)
-    with Recording.open(path) as recording:
-        heard = recording.columns("overheard")
-        heard = heard["time_ns"][heard["listener"] == 3]
-    assert np.any(heard > back), "passive listening was lost with the power and is restored"
+    assert np.any(e.time_ns[(e.initiator == 3) | (e.target == 3)] > back)
+    again = heard["time_ns"][heard["listener"] == 3] > back
+    assert np.any(again), "passive listening was lost with the power and is restored"
 
 
 def test_a_hanging_board_and_damage_on_the_line_are_faults_and_no_invented_ranges(tmp_path):
@@ -157,37 +144,32 @@ def test_a_hanging_board_and_damage_on_the_line_are_faults_and_no_invented_range
         {"kind": "split-writes", "share": 0.3, "gap_ms": 1.0},
         {"kind": "lose-frames", "share": 0.05},
     ]
+
+    def enough():
+        return counts.exchanges > 100 and {"time-out", "garbage"} <= counts.faults.keys()
+
     with served(faults=faults) as server:
-        record(
-            server.names.values(),
-            path,
-            RangingPlan(),
-            duration_s=60.0,
-            listeners=[counts],
-            stop=lambda: counts.exchanges > 100 and {"time-out", "garbage"} <= counts.faults.keys(),
-        )
+        record(server.names.values(), path, RangingPlan(), duration_s=60.0, listeners=[counts], stop=enough)
     exchanges, found, _, _ = stored(path)
     assert {"time-out", "garbage"} <= {fault.kind for fault in found}
     assert len(exchanges) > 25
     # A damaged line that still decoded would show as a range that its own stamps contradict.
-    from uwblink.twr import raw_range
-
     assert np.mean(np.abs(raw_range(exchanges) - exchanges.range_m) < 2e-4) > 0.97
 
 
 def test_two_boards_with_one_id_and_absent_ports_are_refused_before_anything_is_written(tmp_path):
-    path = tmp_path / "f.uwb"
     with served() as one, served() as two:
-        with pytest.raises(PlanError, match="both have the id 1"):
-            record([one.names[1], two.names[1]], path, RangingPlan())
-        with pytest.raises(PortMissingError, match="no such port"):
-            record([one.names[1], "/dev/nothing"], path, RangingPlan())
-        with pytest.raises(PlanError, match="contains 9"):
-            record([one.names[1], one.names[2]], path, RangingPlan(((1, 9),)))
-        path.write_text("mine")
-        with pytest.raises(RecordingExistsError):
-            record([one.names[1], one.names[2]], path, RangingPlan())
-    assert path.read_text() == "mine"
+        (tmp_path / "mine.uwb").write_text("mine")
+        first, second = one.names[1], one.names[2]
+        for ports, plan, name, error, said in (
+            ([first, two.names[1]], RangingPlan(), "f.uwb", PlanError, "both have the id 1"),
+            ([first, "/dev/nothing"], RangingPlan(), "f.uwb", PortMissingError, "no such port"),
+            ([first, second], RangingPlan(((1, 9),)), "f.uwb", PlanError, "names 9"),
+            ([first, second], RangingPlan(), "mine.uwb", RecordingExistsError, None),
+        ):
+            with pytest.raises(error, match=said):
+                record(ports, tmp_path / name, plan)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("mine.uwb", "mine")]
 
 
 def command(path, server, *more):
@@ -213,13 +195,11 @@ def test_ctrl_c_ends_cleanly_and_completely(tmp_path):
         wait_for_rows(path, process)
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=60)
-    assert process.returncode == 0, err
-    assert "Traceback" not in err
-    exchanges, _, _, _ = stored(path)
+    assert (process.returncode, "Traceback" in err) == (0, False), err
+    count = len(load(path).exchanges)
     good, late = (int((re.search(pattern, out) or [0, 0])[1]) for pattern in (r"(\d+) of ", r"time-out (\d+)"))
     # On a busy machine a report may come after its time-out: it is stored, and its turn has failed.
-    assert good <= len(exchanges) <= good + late
-    assert good > 0
+    assert 0 < good <= count <= good + late
     assert not Path(f"{path}.wal").exists()
 
 
@@ -271,9 +251,8 @@ def test_a_recorder_that_is_killed_as_it_begins_leaves_a_recording_or_nothing(tm
         process.kill()
         process.wait()
     if path.exists():
-        exchanges, _, _, meta = stored(path)
-        assert meta["source"] == "boards"
-        assert len(exchanges) < 50
+        found = load(path)
+        assert (found.meta["source"], len(found.exchanges) < 50) == ("boards", True)
     else:
         assert kind != "f.uwb"
 
@@ -281,17 +260,13 @@ def test_a_recorder_that_is_killed_as_it_begins_leaves_a_recording_or_nothing(tm
 @pytest.mark.slow
 def test_a_full_disk_ends_with_a_clear_line_and_a_readable_file(tmp_path):
     path = tmp_path / "f.uwb"
-    limit = 3000  # blocks of 1024 bytes that one file may have
     with served() as server:
         words = " ".join(command(path, server, "--duration", "30", "--passive", "--cir"))
-        done = subprocess.run(
-            ["bash", "-c", f"ulimit -f {limit}; exec {words}"], capture_output=True, text=True, timeout=60
-        )
-    assert done.returncode == 2, done.stdout + done.stderr
-    assert "Traceback" not in done.stderr
+        limited = ["bash", "-c", f"ulimit -f 3000; exec {words}"]  # blocks of 1024 bytes that one file may have
+        done = subprocess.run(limited, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stdout + done.stderr
     assert "cannot be written any more" in done.stderr.splitlines()[-1]
-    exchanges, _, _, _ = stored(path)
-    assert len(exchanges) > 0
+    assert len(load(path).exchanges) > 0
 
 
 @pytest.mark.slow
@@ -302,8 +277,7 @@ def test_one_port_is_for_one_process(tmp_path):
         done = subprocess.run([str(BIN / "uwblink"), "info", server.names[1]], capture_output=True, text=True)
         process.send_signal(signal.SIGINT)
         process.wait()
-    assert done.returncode == 2
-    assert "another process has this port open" in done.stderr
+    assert (done.returncode, "another process has this port open" in done.stderr) == (2, True)
 
 
 def test_damage_other_messages_and_the_bytes_of_an_unfinished_one_are_decoded_again(tmp_path):
@@ -312,8 +286,6 @@ def test_damage_other_messages_and_the_bytes_of_an_unfinished_one_are_decoded_ag
     with Recording.create(tmp_path / "r.uwb", meta={"ports": {"1": "a", "7": "b"}}) as recording:
         recording.append("frames", [FrameRow(k, name, "in", data) for k, (name, data) in enumerate(pieces)])
         again = decode_again(recording)
-    assert again.exchanges.initiator.tolist() == [1, 1]
-    assert [(one.board, one.message) for one in again.others if not isinstance(one.message, Skipped)] == [
-        (7, IdReport(7))
-    ]
+    others = [(one.board, one.message) for one in again.others if not isinstance(one.message, Skipped)]
+    assert (again.exchanges.initiator.tolist(), others) == ([1, 1], [(7, IdReport(7))])
     assert (again.messages, again.skipped_bytes) == (3, len(b"\xff" + b"\xff\r\n" + b"R05|2|3.0"))

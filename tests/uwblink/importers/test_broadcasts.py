@@ -9,6 +9,7 @@ import pytest
 
 import calib
 from tests import processes
+from tests.errors import one_line
 from tests.shared_data import shared
 from tests.uwblink.test_receptions import PLACES, broadcasts
 from uwblink import raw_range
@@ -42,8 +43,25 @@ def printed(receptions, remembered=6):
     return "\n".join(lines) + "\n"
 
 
-def key(columns):
-    return {*zip(*(columns[n].tolist() for n in ("sender", "listener", "tx", "rx")), strict=True)}
+COLUMNS = ("sender", "listener", "tx", "rx")
+
+
+def numbers(found):
+    """The place of each tag's name in the list of names."""
+    return {tag.tag: NAMES.index(tag.body) for tag in found.tags}
+
+
+def distances(found):
+    own = np.vectorize(numbers(found).get)
+    return np.linalg.norm(PLACES[own(found.exchanges.initiator)] - PLACES[own(found.exchanges.target)], axis=1)
+
+
+def imported(tmp_path, text, change=lambda whole: whole):
+    """Import the text of a log by its guess, ticks for what it asks, changed."""
+    (tmp_path / "a.log").write_text(text)
+    whole = guess_map(tmp_path / "a.log").text.replace('"?"', '"ticks"')
+    (tmp_path / "m.toml").write_text(change(whole))
+    return read_source(tmp_path / "a.log", importer="csv", map_file=tmp_path / "m.toml")
 
 
 @pytest.mark.slow
@@ -55,54 +73,39 @@ def test_every_reception_comes_from_the_lists_and_exchanges_from_receptions(tmp_
     assert 'layout = "broadcasts"' in (tmp_path / "m.toml").read_text()
     processes.succeed("uwblink", "import", "csv", "swarm.log", "--map", "m.toml", "-o", "s.uwb", cwd=tmp_path)
     found = load(tmp_path / "s.uwb")
-    named = {tag.tag: NAMES.index(tag.body) + 10 for tag in found.tags}
-    assert sorted(named.values()) == [10, 11, 12, 13]
-    own = np.vectorize(named.get)
+    named = numbers(found)
+    assert sorted(named.values()) == [0, 1, 2, 3]
     got = {
-        n: own(found.receptions[n]) if n in ("sender", "listener") else found.receptions[n] for n in found.receptions
+        tuple(named[n] + 10 for n in row[:2]) + row[2:]
+        for row in zip(*(found.receptions[n].tolist() for n in COLUMNS), strict=True)
     }
+    sent = {*zip(*(getattr(planted, n).tolist() for n in COLUMNS), strict=True)}
     # All but those of the last broadcasts, which no later one lists.
-    columns = {n: getattr(planted, n) for n in ("sender", "listener", "tx", "rx")}
-    missing = key(columns) - key(got)
-    assert key(got) <= key(columns)
-    assert len(missing) <= 3 * 4
+    assert got <= sent
+    assert len(sent - got) <= 3 * 4
     assert np.all(np.diff(found.receptions["frame"]) >= 0)
-    e = found.exchanges
-    distance = np.linalg.norm(PLACES[own(e.initiator) - 10] - PLACES[own(e.target) - 10], axis=1)
-    assert np.abs(raw_range(e) - distance).max() < 0.01
-    assert len(e) > 6 * 900
-    assert len(found.overheard["time_ns"]) > len(e)
+    assert np.abs(raw_range(found.exchanges) - distances(found)).max() < 0.01
+    assert 6 * 900 < len(found.exchanges) < len(found.overheard["time_ns"])
 
 
 def test_numbers_that_begin_anew_are_other_frames(tmp_path):
     first, second = broadcasts(rounds=120), broadcasts(rounds=120, slot_s=0.007)
-    (tmp_path / "a.log").write_text(printed(first) + printed(second))
-    (tmp_path / "m.toml").write_text(guess_map(tmp_path / "a.log").text.replace('"?"', '"ticks"'))
-    found = read_source(tmp_path / "a.log", importer="csv", map_file=tmp_path / "m.toml")
-    named = {tag.tag: NAMES.index(tag.body) for tag in found.tags}
-    ends = [np.vectorize(named.get)(column) for column in (found.exchanges.initiator, found.exchanges.target)]
-    distance = np.linalg.norm(PLACES[ends[0]] - PLACES[ends[1]], axis=1)
+    found = imported(tmp_path, printed(first) + printed(second))
     assert len(found.exchanges) > 6 * 2 * 110
-    assert np.abs(raw_range(found.exchanges) - distance).max() < 0.01
+    assert np.abs(raw_range(found.exchanges) - distances(found)).max() < 0.01
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("change", "said"),
     [
-        ('line = "{json}"\neach = "rx"\nlayout = "broadcasts"\n', "column"),
-        ('line = "{json}"\neach = "nothing"\n', "nothing"),
-        ('line = "{json}"\n[units]\nstamps = "ns"\n', "units.stamps"),
+        (lambda _: 'line = "{json}"\neach = "rx"\nlayout = "broadcasts"\n', "column"),
+        (lambda _: 'line = "{json}"\neach = "nothing"\n', "nothing"),
+        (lambda whole: whole.replace('stamps = "ticks"', 'stamps = "ns"'), "units.stamps"),
     ],
 )
-def test_maps_that_cannot_be_are_refused_with_the_key(tmp_path, text, said):
-    (tmp_path / "a.log").write_text(printed(broadcasts(rounds=30)))
-    whole = guess_map(tmp_path / "a.log").text.replace('"?"', '"ticks"')
-    if "units" in text:
-        text = whole.replace('stamps = "ticks"', 'stamps = "ns"')
-    (tmp_path / "m.toml").write_text(text)
-    with pytest.raises(ImportTableError, match=said) as caught:
-        read_source(tmp_path / "a.log", importer="csv", map_file=tmp_path / "m.toml")
-    assert "\n" not in str(caught.value)
+def test_maps_that_cannot_be_are_refused_with_the_key(tmp_path, change, said):
+    with pytest.raises(ImportTableError, match=one_line(said)):
+        imported(tmp_path, printed(broadcasts(rounds=30)), change)
 
 
 @pytest.fixture(scope="module")
@@ -133,11 +136,9 @@ def test_recorded_boards_give_the_ranges_of_their_description(recorded):
     named = {tag.tag: tag.body.removeprefix("0x") for tag in found.tags}
     known = {"853C-9042": 0.53, "853C-BB1E": 0.60, "853C-E621": 2.09, "9042-BB1E": -0.87, "9042-E621": 0.67}
     for pair, range_m in (known | {"BB1E-E621": 0.70}).items():
-        ends = [
-            np.isin(column, [k for k in named if named[k] in pair])
-            for column in (found.exchanges.initiator, found.exchanges.target)
-        ]
-        ours = found.exchanges.range_m[ends[0] & ends[1]]
+        ends = [k for k in named if named[k] in pair]
+        e = found.exchanges
+        ours = e.range_m[np.isin(e.initiator, ends) & np.isin(e.target, ends)]
         assert len(ours) > 80
         # They are printed to a centimetre; a rate from later frames alone would be off by 5 cm.
         assert np.median(ours) == pytest.approx(range_m, abs=0.011)
@@ -146,8 +147,7 @@ def test_recorded_boards_give_the_ranges_of_their_description(recorded):
 
 def test_a_lossy_run_has_no_range_that_its_stamps_do_not_support(recorded):
     """Seven boards stand still, and one in forty of their stamps is wrong by up to 110 m."""
-    found = load(recorded[70])
-    e = found.exchanges
+    e = load(recorded[70]).exchanges
     assert len(e) > 0.96 * 496, "as many as there are with every stamp"
     pairs = by_pair(e)
     # 0x0E5F heard 0xCDA3 nine times, four or five of them wrong.
@@ -193,8 +193,9 @@ def test_halves_of_a_run_agree_within_their_intervals(recorded, run, first):
 )
 def test_a_geometry_that_was_made_up_is_refuted(recorded, tmp_path, run, use):
     shutil.copy(recorded[run], tmp_path / "q.uwb")
-    grid = (f"[[anchors]]\nid = {k + 1}\nposition_m = [{k % 2}, {k // 2}, 1.0]\n" for k in range(7))
-    (tmp_path / "grid.toml").write_text("".join(grid))
+    (tmp_path / "grid.toml").write_text(
+        "".join(f"[[anchors]]\nid = {k + 1}\nposition_m = [{k % 2}, {k // 2}, 1.0]\n" for k in range(7))
+    )
     processes.succeed("uwblink", "poses", "q.uwb", "--tags", "grid.toml", cwd=tmp_path)
     answer = json.loads(processes.succeed("calib", "doctor", "q.uwb", "--json", cwd=tmp_path).stdout)
     assert answer["findings"][0]["fault"] == "pairs that do not close"

@@ -13,7 +13,18 @@ import numpy as np
 import pytest
 
 from tests import processes
-from tests.uwblink.importers.test_table_forms import as_messages, flights, mapped, read_table, repeated, wrapped, write
+from tests.errors import one_line
+from tests.uwblink.importers.test_table_forms import (
+    HEADER,
+    as_messages,
+    flights,
+    mapped,
+    read_rows,
+    read_table,
+    repeated,
+    wrapped,
+    write,
+)
 from uwblink.errors import ImportTableError, RecordingError
 from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
 from uwblink.importers import (
@@ -34,29 +45,26 @@ HEAD = "time_s,from_id,to_id,range_m\n"
 
 def refused(path):
     """Import a table, which must not work; returns the line that says why."""
-    with pytest.raises(ImportTableError) as caught:
+    with pytest.raises(ImportTableError, match=one_line(path.name)) as caught:
         import_recording(path, path.parent / "o.uwb")
-    said = str(caught.value)
-    assert (said.count("\n"), path.name in said, len(said) < 3000) == (0, True, True)
+    assert len(str(caught.value)) < 3000
     assert [p for p in path.parent.iterdir() if "o.uwb" in p.name] == []
-    return said
+    return str(caught.value)
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".csv.gz"])
-def test_a_line_of_very_many_cells_is_named_with_its_row(tmp_path, suffix):
-    path = tmp_path / f"t{suffix}"
-    text = (HEAD + 30 * LINE + ",".join(["1"] * 200_000) + "\n" + 30 * LINE).encode()
-    path.write_bytes(gzip.compress(text) if suffix.endswith("gz") else text)
-    assert "row 32" in refused(path)
-
-
-def test_a_line_of_very_many_letters_is_named_with_its_row(tmp_path):
-    for name in ("t.csv.gz", "t.jsonl.gz"):
-        with gzip.open(tmp_path / name, "wb", compresslevel=1) as file:
-            file.write(HEAD.encode())
-            for _ in range(40):
-                file.write(b"x" * 1_000_000)
-        assert "row 2" in refused(tmp_path / name)
+@pytest.mark.parametrize(
+    ("name", "cell", "count", "others"),
+    [
+        ("t.csv", "1,", 200_000, 30),
+        ("t.csv.gz", "1,", 200_000, 30),
+        ("t.csv.gz", "x", 40_000_000, 0),
+        ("t.jsonl.gz", "x", 40_000_000, 0),
+    ],
+)
+def test_a_line_of_very_many_cells_or_letters_is_named_with_its_row(tmp_path, name, cell, count, others):
+    text = (HEAD + others * LINE + count * cell + others * f"\n{LINE}").encode()
+    (tmp_path / name).write_bytes(gzip.compress(text, 1) if name.endswith("gz") else text)
+    assert f"row {others + 2}" in refused(tmp_path / name)
 
 
 def test_a_map_of_a_line_without_an_end_is_refused_soon(tmp_path):
@@ -106,8 +114,7 @@ def test_a_table_of_unknown_columns_is_guessed_with_a_line_that_names_them(tmp_p
     (tmp_path / "t.csv").write_text("colour,shape\nred,round\nblue,square\n")
     done = processes.run("uwblink", "import", "guess", tmp_path / "t.csv")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert "colour, shape" in done.stderr
-    assert "SELECT" not in done.stderr
+    assert ("colour, shape" in done.stderr, "SELECT" in done.stderr) == (True, False)
 
 
 class StrangeError(Exception):
@@ -129,8 +136,7 @@ def test_a_plug_in_that_fails_is_one_line_with_its_name(tmp_path):
     finally:
         IMPORTERS.remove("flux")
     register_exporter(Exporter("flux", fails, "flux"))
-    source = write(tmp_path / "t.csv", wrapped(flights()))
-    import_recording(source, tmp_path / "t.uwb")
+    import_recording(write(tmp_path / "t.csv", wrapped(flights())), tmp_path / "t.uwb")
     try:
         with pytest.raises(RecordingError, match=r"'flux'.*StrangeError"):
             export_recording(tmp_path / "t.uwb", tmp_path / "out", to="flux")
@@ -182,15 +188,9 @@ def told(contents):
     return json.dumps([listed, contents.meta, list(map(str, contents.tags + contents.faults))], default=str)
 
 
-def few_at_once(monkeypatch, count=20):
-    monkeypatch.setattr(staging, "ROWS_PER_BLOCK", count)
-    monkeypatch.setattr(staging, "FAULTS_AT_ONCE", 5)
-
-
 def lines_of(layout):
     """Exchanges as rows in any order, some lost and some that nobody can use."""
-    rows = flights(80)
-    plain = wrapped(rows)
+    plain = wrapped(flights(80))
     if layout == "messages":
         lines = as_messages(plain)
     elif layout == "stamps":
@@ -200,11 +200,9 @@ def lines_of(layout):
             for kind in ("tx", "rx")
         ]
     else:
-        common = ("time_s", "from_id", "to_id")
-        ours = [{n: row[n] for n in (*common, "tx1", "rx2", "rx3")} | {"seq": k} for k, row in enumerate(plain)]
-        theirs = [{n: row[n] for n in (*common, "rx1", "tx2", "tx3")} | {"seq": k} for k, row in enumerate(plain)]
-        names = dict.fromkeys(n for line in (ours[0], theirs[0]) for n in line)
-        lines = [dict.fromkeys(names, "") | line for line in ours + theirs]
+        ours, theirs = (dict.fromkeys(names, "") for names in (("rx1", "tx2", "tx3"), ("tx1", "rx2", "rx3")))
+        whole = [{n: row[n] for n in HEADER[:9]} | {"seq": k} for k, row in enumerate(plain)]
+        lines = [row | empty for empty in (ours, theirs) for row in whole]
     np.random.default_rng(2).shuffle(lines)
     del lines[5]
     lines[8] = lines[8] | {"from_id": "?"}
@@ -217,7 +215,8 @@ def test_a_long_table_is_the_same_a_few_rows_at_a_time(tmp_path, monkeypatch, la
     text = mapped(tmp_path, f'layout = "{layout}"\nwithin_s = 0.1\n[columns]\nsequence = "seq"\n')
     whole = read_table(table, text)
     assert 70 < len(whole.exchanges) < 80
-    few_at_once(monkeypatch, 50)
+    monkeypatch.setattr(staging, "ROWS_PER_BLOCK", 50)
+    monkeypatch.setattr(staging, "FAULTS_AT_ONCE", 5)
     assert told(read_table(table, text)) == told(whole)
     said = []
     done = import_file(table, tmp_path / "t.uwb", map_file=text, watch=lambda *one: said.append(one))
@@ -229,16 +228,15 @@ def test_a_long_table_is_the_same_a_few_rows_at_a_time(tmp_path, monkeypatch, la
 @pytest.mark.parametrize("layout", ["messages", "stamps", "parts"])
 def test_a_table_without_any_device_says_so(tmp_path, layout):
     lines = [line | {"from_id": "", "message": 1} for line in lines_of(layout)]
-    text = mapped(tmp_path, f'layout = "{layout}"\n[columns]\nsequence = "seq"\n')
     with pytest.raises(ImportTableError, match="row 2, column 'from_id'"):
-        read_table(write(tmp_path / "t.csv", lines), text)
+        read_rows(tmp_path, lines, f'layout = "{layout}"\n[columns]\nsequence = "seq"\n')
 
 
 @pytest.mark.parametrize(("layout", "missing"), [("messages", "tx"), ("stamps", "event")])
 def test_what_a_layout_needs_is_said(tmp_path, layout, missing):
     lines = [{n: v for n, v in line.items() if n != missing} for line in lines_of(layout)]
     with pytest.raises(ImportTableError, match=f"column '{missing}' is missing"):
-        read_table(write(tmp_path / "t.csv", lines), mapped(tmp_path, f'layout = "{layout}"'))
+        read_rows(tmp_path, lines, f'layout = "{layout}"')
 
 
 class Bag:

@@ -6,6 +6,7 @@ import struct
 import numpy as np
 import pytest
 
+from tests.errors import one_line
 from uwblink.errors import ImportTableError
 from uwblink.exporters import export_recording
 from uwblink.importers import read_source
@@ -43,17 +44,8 @@ def exported(tmp_path):
 def test_ranges_come_in_again_without_a_map(exported):
     held, path = exported
     found = read_source(path).exchanges
-    for name in (
-        "time_ns",
-        "initiator",
-        "target",
-        "range_m",
-        "truth_m",
-        "fpp1_dbm",
-        "fpp2_dbm",
-        "skew1_ppm",
-        "skew2_ppm",
-    ):
+    names = "time_ns initiator target range_m truth_m fpp1_dbm fpp2_dbm skew1_ppm skew2_ppm"
+    for name in names.split():
         np.testing.assert_array_equal(getattr(found, name), getattr(held.exchanges, name), err_msg=name)
     assert not found.tx1.any()
 
@@ -61,12 +53,10 @@ def test_ranges_come_in_again_without_a_map(exported):
 def test_poses_come_in_again(exported):
     held, path = exported
     found = read_poses(path)
-    assert found.time_ns.tolist() == held.poses.time_ns.tolist()
-    assert found.body.tolist() == held.poses.body.tolist()
-    np.testing.assert_array_equal(found.position_m, held.poses.position_m)
+    for name in ("time_ns", "body", "position_m"):
+        assert getattr(found, name).tolist() == getattr(held.poses, name).tolist()
     np.testing.assert_allclose(found.quaternion, held.poses.quaternion, atol=1e-15)
-    only = read_poses(path, topics={"lorry": "/poses/car"})
-    assert set(only.body) == {"lorry"}
+    assert set(read_poses(path, topics={"lorry": "/poses/car"}).body) == {"lorry"}
 
 
 def written(path, messages, schema="uwb_msgs.Range", compressed=False):
@@ -125,33 +115,20 @@ def test_what_is_no_pose_is_one_line(tmp_path, message, said):
         read_poses(path)
 
 
-def test_messages_nested_deeply_are_one_line(tmp_path):
-    deep = b'{"a":' * 700 + b"1" + b"}" * 700
-    path = written(tmp_path / "t.mcap", {"/uwb": [deep]})
-    with pytest.raises(ImportTableError):
-        read_source(path)
-
-
 # Versions of rosbags before 0.11.9 leave a file open that they refuse.
 @pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO.*z.mcap:pytest.PytestUnraisableExceptionWarning")
-def test_cut_and_broken_files_are_one_line(exported, tmp_path):
-    _, path = exported
-    data = path.read_bytes()
-    for cut in range(9, len(data) - 40, 1013):
-        (tmp_path / "cut.mcap").write_bytes(data[:cut])
-        with pytest.raises(ImportTableError):
-            read_source(tmp_path / "cut.mcap")
-    longest = struct.pack("<BQ", 0x05, 2**63)
-    (tmp_path / "long.mcap").write_bytes(data[: data.index(b"uwbcal") + 6] + longest)
-    with pytest.raises(ImportTableError, match=r"long\.mcap"):
-        read_source(tmp_path / "long.mcap")
-
-
-def test_a_chunk_that_unpacks_to_more_than_memory_holds_is_refused(tmp_path):
-    times_and_size = struct.pack("<QQQI", 0, 0, 2**40, 0)
-    content = times_and_size + struct.pack("<I", 4) + b"zstd" + struct.pack("<Q", 0)
-    header = struct.pack("<BQ", 0x01, 8) + bytes(8)
-    data = b"\x89MCAP0\r\n" + header + struct.pack("<BQ", 0x06, len(content)) + content
-    (tmp_path / "bomb.mcap").write_bytes(data)
-    with pytest.raises(ImportTableError, match=r"bomb\.mcap"):
-        read_source(tmp_path / "bomb.mcap")
+def test_cut_broken_and_endless_files_are_one_line(exported, tmp_path):
+    data, path = exported[1].read_bytes(), tmp_path / "t.mcap"
+    # A chunk that unpacks to more than memory holds.
+    content = struct.pack("<QQQII", 0, 0, 2**40, 0, 4) + b"zstd" + struct.pack("<Q", 0)
+    bomb = b"\x89MCAP0\r\n" + struct.pack("<BQ", 0x01, 8) + bytes(8) + struct.pack("<BQ", 0x06, len(content)) + content
+    longest = data[: data.index(b"uwbcal") + 6] + struct.pack("<BQ", 0x05, 2**63)
+    cuts = [(data[:cut], "") for cut in range(9, len(data) - 40, 1013)]
+    for broken, said in (*cuts, (longest, ""), (bomb, "a chunk unpacks to 1099511627776 bytes")):
+        path.write_bytes(broken)
+        with pytest.raises(ImportTableError, match=one_line("t.mcap", said)):
+            read_source(path)
+    path.unlink()
+    # An object that is nested too deeply.
+    with pytest.raises(ImportTableError, match=one_line("t.mcap")):
+        read_source(written(path, {"/uwb": [b'{"a":' * 700 + b"1" + b"}" * 700]}))

@@ -10,6 +10,7 @@ from uwblink.exporters import export_recording
 from uwblink.importers import add_poses
 from uwblink.importers.poses import read_poses
 from uwblink.recording.contents import Contents, load
+from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import Exchanges
 
@@ -59,8 +60,7 @@ def bag(path, messages):
 def test_every_kind_of_message(tmp_path, topic, kind, frame):
     bag(tmp_path / "bag", [(topic, kind, 5.0, frame)])
     poses = read_poses(tmp_path / "bag")
-    assert poses.body.tolist() == ["drone"] * 3
-    assert poses.time_ns.tolist() == [500, 1_000_000_500, 2_000_000_500]
+    assert (poses.body.tolist(), poses.time_ns.tolist()) == (["drone"] * 3, [500, 1_000_000_500, 2_000_000_500])
     assert poses.position_m.tolist() == [[5.0, 2.0, 3.0], [6.0, 2.0, 3.0], [7.0, 2.0, 3.0]]
     np.testing.assert_allclose(poses.quaternion, [TURNED] * 3)
 
@@ -70,13 +70,14 @@ def test_topics_by_body(tmp_path):
     bag(tmp_path / "bag", [("/a/pose", pose, 1.0, ""), ("/b/pose", pose, 2.0, ""), ("/c/odom", odometry, 3.0, "x")])
     assert set(read_poses(tmp_path / "bag").body) == {"a", "b"}
     poses = read_poses(tmp_path / "bag", topics={"drone": "/b/pose", "car": "/c/odom"})
-    assert poses[poses.body == "drone"].position_m[0, 0] == 2.0
-    assert poses[poses.body == "car"].position_m[0, 0] == 3.0
-    with pytest.raises(ImportTableError, match=r"'/d' is not there; topics with poses are /a/pose, /b/pose, /c/odom"):
-        read_poses(tmp_path / "bag", topics={"drone": "/d"})
+    assert [poses[poses.body == body].position_m[0, 0] for body in ("drone", "car")] == [2.0, 3.0]
     (tmp_path / "t.tum").write_text("0 1 2 3 0 0 0 1\n")
-    with pytest.raises(ImportTableError, match="has no topics"):
-        read_poses(tmp_path / "t.tum", topics={"drone": "/d"})
+    for name, said in (
+        ("bag", "'/d' is not there; topics with poses are /a/pose, /b/pose, /c/odom"),
+        ("t.tum", "has no topics"),
+    ):
+        with pytest.raises(ImportTableError, match=said):
+            read_poses(tmp_path / name, topics={"drone": "/d"})
 
 
 @pytest.fixture
@@ -85,24 +86,19 @@ def recording(tmp_path):
     ids = np.array([[1, 2], [1, 9], [2, 9]] * 5)
     when = np.arange(15) * 100_000_000
     e = Exchanges.from_arrays(ids[:, 0], ids[:, 1], time_ns=when, tx1=[0] * 15, rx1=5, tx2=1005, rx2=3000)
-    poses = [
-        Poses.from_arrays(np.arange(20) * 10**8, body, [[x, 0.0, k / 10] for k in range(20)])
-        for body, x in (("car", 0.0), ("drone", 4.0))
-    ]
-    tags = [Tag(1, "car", (0.0, 0.0, 0.0)), Tag(2, "drone", (0.0, 0.0, 0.0)), Tag(9, "tag9", (0.0, 0.0, 0.0))]
-    for part in poses:
-        Contents(exchanges=e, poses=part).save(tmp_path / "one.uwb", force=True)
-        export_recording(tmp_path / "one.uwb", tmp_path / "tum", to="tum", force=True)
-        name = f"{part.body[0]}.tum"
-        (tmp_path / "tum" / name).rename(tmp_path / name)
+    tags = [Tag(k, body, (0.0, 0.0, 0.0)) for k, body in ((1, "car"), (2, "drone"), (9, "tag9"))]
+    for body, x in (("car", 0.0), ("drone", 4.0)):
+        poses = Poses.from_arrays(np.arange(20) * 10**8, body, [[x, 0.0, k / 10] for k in range(20)])
+        Contents(exchanges=e, poses=poses).save(tmp_path / "one.uwb", force=True)
+        export_recording(tmp_path / "one.uwb", tmp_path / body, to="tum")
     Contents(exchanges=e, tags=tags).save(tmp_path / "r.uwb")
     return tmp_path / "r.uwb"
 
 
 def test_bodies_without_poses_are_named_whether_some_or_no_ranges_have_both_ends(recording, tmp_path):
     """Of pairs 1-2, 1-9 and 2-9 the car's and the drone's have poses, or none."""
-    places, files = tmp_path / "places.toml", ["--from", f"car={tmp_path / 'car.tum'}"]
-    done = processes.run("uwblink", "poses", recording, *files, "--from", f"drone={tmp_path / 'drone.tum'}")
+    places, files = tmp_path / "places.toml", ["--from", f"car={tmp_path / 'car' / 'car.tum'}"]
+    done = processes.run("uwblink", "poses", recording, *files, "--from", f"drone={tmp_path / 'drone' / 'drone.tum'}")
     assert (done.returncode, done.stderr) == (0, "")
     assert "5 of 15 measurements have a true distance; no poses of tag9" in done.stdout
     places.write_text("".join(f'[[tags]]\nid = {k}\nbody = "{name}"\n' for k, name in ((1, "Car"), (2, "car"))))
@@ -113,18 +109,15 @@ def test_bodies_without_poses_are_named_whether_some_or_no_ranges_have_both_ends
 
 def test_trajectories_of_several_bodies_and_anchors(recording, tmp_path):
     (tmp_path / "places.toml").write_text("[[anchors]]\nid = 9\nposition_m = [0.0, 3.0, 0.0]\n")
-    files = {"car": tmp_path / "car.tum", "drone": tmp_path / "drone.tum"}
+    files = {body: tmp_path / body / f"{body}.tum" for body in ("car", "drone")}
     found = add_poses(recording, files, tags_from=tmp_path / "places.toml")
     assert (found.bodies, found.covered, found.exchanges) == (("anchor9", "car", "drone"), 15, 15)
     held = load(recording)
     assert {tag.tag: tag.body for tag in held.tags} == {1: "car", 2: "drone", 9: "anchor9"}
     assert (held.poses.body == "anchor9").sum() == 1
-    from uwblink.recording.distances import distances_m
-
     e = held.exchanges
     true_m = distances_m(held.poses, held.tags, e.initiator, e.target, e.time_ns)
-    np.testing.assert_allclose(true_m[0], 4.0)
-    np.testing.assert_allclose(true_m[1], np.hypot(3.0, 0.1))
+    np.testing.assert_allclose(true_m[:2], [4.0, np.hypot(3.0, 0.1)])
 
 
 def test_anchors_that_cannot_be(recording, tmp_path):
@@ -139,5 +132,5 @@ def test_anchors_that_cannot_be(recording, tmp_path):
     ):
         (tmp_path / "places.toml").write_text(text)
         with pytest.raises(PlanError, match=one_line(fragment)):
-            add_poses(recording, tmp_path / "car.tum", body="car", tags_from=tmp_path / "places.toml")
+            add_poses(recording, tmp_path / "car" / "car.tum", body="car", tags_from=tmp_path / "places.toml")
     assert not load(recording).poses

@@ -1,13 +1,12 @@
 """A kind of file that somebody adds: from Python and from the command line, and what is refused."""
 
-import sys
+from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from uwblink.cli import main
+from tests.processes import succeed
 from uwblink.errors import ArgumentError, ImportTableError, RecordingExistsError
 from uwblink.importers import IMPORTERS, Importer, import_recording, register_importer
 from uwblink.recording.contents import Contents, load
@@ -26,12 +25,22 @@ def read_blanks(source, map_file):
 BLANKS = Importer("blanks", (".ranges", ".ranges.txt"), read_blanks, "Import six numbers a line.", "What they mean.")
 
 
+@contextmanager
+def registered(**changes):
+    """Register an importer like BLANKS for a while."""
+    changed = replace(BLANKS, **changes)
+    register_importer(changed)
+    try:
+        yield
+    finally:
+        IMPORTERS.remove(changed.name)
+
+
 @pytest.fixture
 def source(tmp_path):
-    register_importer(BLANKS)
     (tmp_path / "my.Ranges").write_text("1 2 0 5 1005 3000\n2 3 9 3 1003 3009\n")
-    yield tmp_path / "my.Ranges"
-    IMPORTERS.remove("blanks")
+    with registered():
+        yield tmp_path / "my.Ranges"
 
 
 def test_python_knows_it_by_suffix_and_by_name(source, tmp_path):
@@ -42,17 +51,11 @@ def test_python_knows_it_by_suffix_and_by_name(source, tmp_path):
     np.testing.assert_allclose(load(tmp_path / "a.uwb").exchanges.range_m, 4.690357, rtol=1e-6)
 
 
-def test_without_a_map_there_is_no_option_for_one(tmp_path, monkeypatch, capsys):
-    register_importer(replace(BLANKS, name="plain", map_help=None))
-    try:
-        monkeypatch.setattr(sys, "argv", ["uwblink", "import", "plain", "--help"])
-        with pytest.raises(SystemExit):
-            main()
-        assert "--map" not in capsys.readouterr().out
-        with pytest.raises(ArgumentError, match="`map_file`: importer 'plain' uses none"):
+def test_without_a_map_there_is_no_option_for_one(tmp_path):
+    with registered(name="plain", map_help=None):
+        assert "--map" not in succeed("uwblink", "import", "plain", "--help").stdout
+        with pytest.raises(ArgumentError, match="`map_file`: importer 'plain' takes none"):
             import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb", importer="plain", map_file=tmp_path / "m")
-    finally:
-        IMPORTERS.remove("plain")
 
 
 def test_what_cannot_be_imported_says_so(source, tmp_path):
@@ -86,10 +89,6 @@ def test_rows_that_cannot_work_are_refused(change, expected):
 
 
 def test_a_reader_must_return_contents(tmp_path):
-    read: Any = lambda _source, _map: [1, 2]  # noqa: E731 - untyped on purpose
-    register_importer(replace(BLANKS, name="broken", read=read))
-    try:
-        with pytest.raises(ArgumentError, match=r"importer 'broken': returned \[1, 2\], expected Contents"):
-            import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb")
-    finally:
-        IMPORTERS.remove("broken")
+    broken = pytest.raises(ArgumentError, match=r"importer 'broken': returned \[1, 2\], expected Contents")
+    with registered(name="broken", read=lambda _source, _map: [1, 2]), broken:
+        import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb")

@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from tests.uwblink.importers.test_table_forms import AIR, HEADER, TICKS, flights, mapped, read_table, wrapped, write
+from tests.uwblink.importers.test_table_forms import (
+    AIR,
+    HEADER,
+    TICKS,
+    flights,
+    mapped,
+    read_rows,
+    read_table,
+    wrapped,
+    write,
+)
 from uwblink.errors import ImportTableError
 from uwblink.importers.guess import guess_map
 
@@ -12,19 +22,15 @@ def test_the_same_stamps_of_the_same_devices_are_one_exchange(tmp_path):
     """The second log has another host's clock, and its own power; the first row counts."""
     rows = wrapped(flights(317))
     again = [row | {"time_s": row["time_s"] + 0.003, "fpp1": -99.0} for row in rows[:246:2]]
-    mixed = sorted([*rows, *again], key=lambda row: row["time_s"])
-    path = write(tmp_path / "t.csv", mixed)
-    whole = read_table(path)
-    assert "123 of 440 rows" in whole.meta["notes"][0]
-    found = whole.exchanges
-    assert found.tx1.tolist() == [row["tx1"] for row in rows]
-    assert found.fpp1_dbm.tolist() == [row["fpp1"] for row in rows]
+    found = read_rows(tmp_path, sorted([*rows, *again], key=lambda row: row["time_s"]))
+    assert "123 of 440 rows" in found.meta["notes"][0]
+    columns = found.exchanges.tx1.tolist(), found.exchanges.fpp1_dbm.tolist()
+    assert columns == tuple([row[name] for row in rows] for name in ("tx1", "fpp1"))
 
 
 def test_logs_in_files_of_their_own(tmp_path):
     rows = wrapped(flights(90))
-    one, other = write(tmp_path / "a.csv", rows[:60]), write(tmp_path / "b.csv", rows[30:])
-    found = read_table([one, other])
+    found = read_table([write(tmp_path / "a.csv", rows[:60]), write(tmp_path / "b.csv", rows[30:])])
     assert found.exchanges.tx1.tolist() == [row["tx1"] for row in rows]
     assert found.exchanges.time_ns.tolist() == sorted(found.exchanges.time_ns.tolist())
     assert any("30 of 120 rows" in note for note in found.meta["notes"])
@@ -32,14 +38,11 @@ def test_logs_in_files_of_their_own(tmp_path):
 
 def test_unusable_rows_and_rows_without_stamps_are_no_repetition(tmp_path):
     rows = wrapped(flights(60))
-    broken = [dict(row) for row in rows]
-    for row in broken[::7]:
-        row["tx2"] = ""
-    found = read_table(write(tmp_path / "t.csv", broken))
-    assert len(found.exchanges) == 60 - len(broken[::7])
+    found = read_rows(tmp_path, [row if k % 7 else row | {"tx2": ""} for k, row in enumerate(rows)])
+    assert len(found.exchanges) == 60 - 9
     assert not any("repeat" in note for note in found.meta["notes"])
     zeros = [row | dict.fromkeys(HEADER[3:9], 0) | {"range_m": 3.25} for row in rows]
-    assert len(read_table(write(tmp_path / "z.csv", zeros)).exchanges) == 60
+    assert len(read_rows(tmp_path, zeros).exchanges) == 60
 
 
 def plain(count, every_s, jitter_s, share, seed, quantum=0.01, noise=0.03):
@@ -61,7 +64,7 @@ def plain(count, every_s, jitter_s, share, seed, quantum=0.01, noise=0.03):
 @pytest.mark.parametrize("seed", [0, 2])
 def test_ranges_without_stamps_that_both_devices_logged_are_merged(tmp_path, seed):
     rows = plain(317, 0.05, 0.004, 0.39, seed)
-    found = read_table(write(tmp_path / "t.csv", rows))
+    found = read_rows(tmp_path, rows)
     first = [
         row["range_m"]
         for k, row in enumerate(rows)
@@ -77,15 +80,14 @@ def test_ranges_that_are_repeated_from_the_same_end_are_told_and_kept(tmp_path):
     rows = [
         row | {"from_id": min(row["from_id"], row["to_id"]), "to_id": max(row["from_id"], row["to_id"])} for row in rows
     ]
-    found = read_table(write(tmp_path / "t.csv", rows))
+    found = read_rows(tmp_path, rows)
     assert len(found.exchanges) == len(rows)
     assert any("may be logged twice" in note for note in found.meta["notes"])
 
 
 @pytest.mark.parametrize(("quantum", "noise"), [(0.1, 0.03), (0.01, 0.0)])
 def test_ranges_that_are_equal_by_chance_are_not_told(tmp_path, quantum, noise):
-    found = read_table(write(tmp_path / "t.csv", plain(600, 0.05, 0, 0, 1, quantum, noise)))
-    assert not found.meta["notes"]
+    assert not read_rows(tmp_path, plain(600, 0.05, 0, 0, 1, quantum, noise)).meta["notes"]
 
 
 # Stamps of devices with and without antenna delays in them, and of protocols that need more than stamps.
@@ -106,9 +108,8 @@ def undelayed(rows, tags=(1, 2, 3), delay=PROGRAMMED):
     return found
 
 
-def table(tmp_path, rows):
-    truths = [{"gt_range_m": row["truth"]} for row in rows]
-    return write(tmp_path / "t.csv", [row | truth for row, truth in zip(wrapped(rows), truths, strict=True)])
+def with_truth(rows):
+    return [short | {"gt_range_m": row["truth"]} for short, row in zip(wrapped(rows), rows, strict=True)]
 
 
 ZEROS = "[antenna_delays]\ntx = 0\nrx = 0\n"
@@ -116,8 +117,7 @@ ZEROS = "[antenna_delays]\ntx = 0\nrx = 0\n"
 
 @pytest.mark.parametrize("said", ["", ZEROS, "protocol = 'ds'\nbits = 32\n" + ZEROS])
 def test_devices_without_antenna_delays_are_read_beside_true_distances(tmp_path, said):
-    rows = undelayed(flights())
-    found = read_table(table(tmp_path, rows), mapped(tmp_path, said))
+    found = read_rows(tmp_path, with_truth(undelayed(flights())), said)
     assert set(found.exchanges.protocol) == {"ds"}
     assert found.meta["configured_antenna_delay_ticks"] == {"tx": 0, "rx": 0}
     longer = found.exchanges.range_m - found.exchanges.truth_m
@@ -126,24 +126,21 @@ def test_devices_without_antenna_delays_are_read_beside_true_distances(tmp_path,
 
 
 def test_a_guess_says_that_nothing_was_programmed(tmp_path):
-    path = table(tmp_path, undelayed(flights()))
-    mapped(tmp_path, guess_map(path).text)
-    assert read_table(path, tmp_path / "map.toml").meta["configured_antenna_delay_ticks"] == {"tx": 0, "rx": 0}
-    found = read_table(path, mapped(tmp_path, guess_map(table(tmp_path, flights())).text))
-    assert found.meta["configured_antenna_delay_ticks"] == {"tx": PROGRAMMED, "rx": PROGRAMMED}
+    for rows, ticks in ((undelayed(flights()), 0), (flights(), PROGRAMMED)):
+        path = write(tmp_path / "t.csv", with_truth(rows))
+        found = read_table(path, mapped(tmp_path, guess_map(path).text))
+        assert found.meta["configured_antenna_delay_ticks"] == {"tx": ticks, "rx": ticks}
 
 
 def test_one_device_without_antenna_delays(tmp_path):
     """Ranges to it are 77 m longer, which the map explains."""
-    path = table(tmp_path, undelayed(flights(), tags=(2,)))
     said = f"[antenna_delays]\ntx = {PROGRAMMED}\nrx = {PROGRAMMED}\n[antenna_delays.tags.2]\ntx = 0\nrx = 0\n"
-    found = read_table(path, mapped(tmp_path, said))
-    assert set(found.exchanges.protocol) == {"ds"}
-    assert not found.meta["notes"]
+    found = read_rows(tmp_path, with_truth(undelayed(flights(), tags=(2,))), said)
+    assert (set(found.exchanges.protocol), found.meta["notes"]) == ({"ds"}, [])
     assert found.meta["configured_antenna_delay_ticks_by_tag"] == {"2": {"tx": 0, "rx": 0}}
 
 
 def test_what_a_map_says_of_antenna_delays_is_not_overruled(tmp_path):
-    path = table(tmp_path, undelayed(flights()))
+    rows = with_truth(undelayed(flights()))
     with pytest.raises(ImportTableError, match="antenna_delays"):
-        read_table(path, mapped(tmp_path, f"[antenna_delays]\ntx = {PROGRAMMED}\nrx = {PROGRAMMED}\n"))
+        read_rows(tmp_path, rows, f"[antenna_delays]\ntx = {PROGRAMMED}\nrx = {PROGRAMMED}\n")

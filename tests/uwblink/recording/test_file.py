@@ -9,7 +9,9 @@ import duckdb
 import numpy as np
 import pytest
 
+from tests.errors import one_line
 from uwblink.errors import RecordingError, RecordingExistsError
+from uwblink.recording.contents import Contents, load
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import TABLES, CirRow, Fault, Poses, Tag
 from uwblink.twr import COLUMNS, Exchanges
@@ -41,15 +43,23 @@ def recording(written, tmp_path):
     return shutil.copyfile(written, tmp_path / "flight.uwb")
 
 
+def change(path, *statements):
+    with duckdb.connect(str(path)) as db:
+        for statement in statements:
+            db.execute(statement)
+
+
+LATER = ("imu", "height", "powers", "quality", "temperature", "receptions", "differences", "corrected")
+"""Tables that files from before them do not have."""
+
+
 def test_an_existing_file_is_not_replaced_without_force(recording):
     before = recording.read_bytes()
     with pytest.raises(RecordingExistsError, match="or replace it with `force`"):
         Recording.create(recording)
     assert recording.read_bytes() == before
-    with Recording.create(recording, force=True):
-        pass
-    with Recording.open(recording) as r:
-        assert r.count("exchanges") == 0
+    Contents(exchanges=random_exchanges(0)).save(recording, force=True)
+    assert len(load(recording).exchanges) == 0
 
 
 def test_a_failed_block_leaves_nothing_behind(tmp_path):
@@ -62,37 +72,40 @@ def test_a_failed_block_leaves_nothing_behind(tmp_path):
 @pytest.mark.parametrize("share", [0.001, 0.3, 0.6, 0.9, 0.99])
 def test_a_truncated_recording_is_one_clear_error(recording, tmp_path, share):
     content = recording.read_bytes()
-    cut = tmp_path / "cut.uwb"
-    cut.write_bytes(content[: int(len(content) * share)])
-    with pytest.raises(RecordingError, match=r"cut\.uwb"), Recording.open(cut) as r:
-        r.exchanges()
+    (tmp_path / "cut.uwb").write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(RecordingError, match=r"cut\.uwb"):
+        load(tmp_path / "cut.uwb")
 
 
-def test_wrong_tables_and_newer_versions(recording):
-    with duckdb.connect(str(recording)) as db:
-        db.execute("UPDATE meta SET value = '99' WHERE key = 'format_version'")
-    with pytest.raises(RecordingError, match="version 99 is newer"):
-        Recording.open(recording)
-    with duckdb.connect(str(recording)) as db:
-        db.execute("UPDATE meta SET value = '1' WHERE key = 'format_version'")
-        db.execute("ALTER TABLE exchanges DROP COLUMN rx3")
-    with pytest.raises(RecordingError, match="exchanges lacks rx3"):
+@pytest.mark.parametrize(
+    ("statement", "said"),
+    [
+        ("UPDATE meta SET value = '99' WHERE key = 'format_version'", "version 99 is newer"),
+        ("ALTER TABLE exchanges DROP COLUMN rx3", "exchanges lacks rx3"),
+        ("DROP TABLE poses", "table poses lacks"),
+        *(
+            (f"ALTER TABLE {table} DROP COLUMN {column}", f"table {table} lacks {column}")
+            for table in LATER
+            for column in list(TABLES[table])[-1:]
+        ),
+    ],
+)
+def test_wrong_tables_and_newer_versions(recording, statement, said):
+    """Tables of `LATER` may be missing, but not in part."""
+    change(recording, statement)
+    with pytest.raises(RecordingError, match=said):
         Recording.open(recording)
 
 
 def test_a_recording_from_before_faults_named_their_exchange_is_read(recording, tmp_path):
-    with duckdb.connect(str(recording)) as db:
-        db.execute("ALTER TABLE faults DROP COLUMN initiator")
-        db.execute("ALTER TABLE faults DROP COLUMN target")
+    change(recording, "ALTER TABLE faults DROP COLUMN initiator", "ALTER TABLE faults DROP COLUMN target")
+    first, later = Fault(9, "1", "time-out", "no answer", None, None), Fault(10, "1", "time-out", "no answer", 1, 2)
     with Recording.open(recording) as r:
-        assert r.faults() == [Fault(9, "1", "time-out", "no answer", None, None)]
+        assert r.faults() == [first]
         r.copy(tmp_path / "copy.uwb")
-    later = Fault(10, "1", "time-out", "no answer", 1, 2)
     with Recording.open(recording, update=True) as r:
         r.append("faults", [later])
-    for path, added in ((tmp_path / "copy.uwb", []), (recording, [later])):
-        with Recording.open(path) as r:
-            assert r.faults() == [Fault(9, "1", "time-out", "no answer", None, None), *added]
+    assert [load(path).faults for path in (tmp_path / "copy.uwb", recording)] == [[first], [first, later]]
 
 
 HOLDER = """
@@ -117,19 +130,17 @@ def test_a_file_in_use_elsewhere_says_so(recording, held):
 
 
 def test_a_damaged_file_with_the_word_lock_in_its_path_is_damaged(recording, tmp_path):
-    path = tmp_path / "blocks.uwb"
-    path.write_bytes(b"\0" * len(recording.read_bytes()))
+    (tmp_path / "blocks.uwb").write_bytes(b"\0" * recording.stat().st_size)
     with pytest.raises(RecordingError, match=r"not a \.uwb recording, or a truncated one"):
-        Recording.open(path)
+        Recording.open(tmp_path / "blocks.uwb")
 
 
 @pytest.mark.parametrize(("name", "command"), [("t.csv", "csv"), ("t.csv.gz", "csv"), ("t.MCAP", "bag")])
 @pytest.mark.parametrize("size", [100, 3 * 4096 + 16384])  # odd, and that of a database
 def test_a_table_given_for_a_recording_is_told_how_to_become_one(tmp_path, name, command, size):
-    path = tmp_path / name
-    path.write_bytes(b"a" * size)
-    with pytest.raises(RecordingError, match=f"{name}: is not a recording; convert it with `uwblink import {command}`"):
-        Recording.open(path)
+    (tmp_path / name).write_bytes(b"a" * size)
+    with pytest.raises(RecordingError, match=f"{name}: is no recording yet; `uwblink import {command}` makes one"):
+        Recording.open(tmp_path / name)
 
 
 def test_a_recording_that_this_program_is_writing_says_so(tmp_path):
@@ -164,31 +175,20 @@ def test_a_recording_that_this_program_is_writing_says_so(tmp_path):
 def test_what_does_not_fit_is_one_line_and_leaves_the_rest_of_a_transaction_out(tmp_path, write, expected):
     with Recording.create(tmp_path / "f.uwb", live=True) as r:
         r.append_exchanges(random_exchanges(7))
-        with pytest.raises(RecordingError, match=expected) as caught, r.transaction():
+        with pytest.raises(RecordingError, match=one_line(expected)), r.transaction():
             r.append_exchanges(random_exchanges(5))
             write(r)
-        assert "\n" not in str(caught.value)
         assert r.count("exchanges") == 7
         r.append_exchanges(random_exchanges(2))
-    with Recording.open(tmp_path / "f.uwb") as r:
-        assert r.count("exchanges") == 9
-
-
-# Files that are older than some of the tables.
-
-
-LATER = ("imu", "height", "powers", "quality", "temperature", "receptions", "differences", "corrected")
+    assert len(load(tmp_path / "f.uwb").exchanges) == 9
 
 
 @pytest.fixture
 def older(tmp_path):
-    path = tmp_path / "older.uwb"
-    with Recording.create(path) as recording:
-        recording.append_tags([Tag(1, "drone", (0.0, 0.0, 0.0))])
-    with duckdb.connect(str(path)) as db:
-        for table in LATER:
-            db.execute(f"DROP TABLE {table}")
-    return path
+    tags = [Tag(1, "drone", (0.0, 0.0, 0.0))]
+    Contents(exchanges=random_exchanges(0), tags=tags).save(tmp_path / "older.uwb")
+    change(tmp_path / "older.uwb", *(f"DROP TABLE {table}" for table in LATER))
+    return tmp_path / "older.uwb"
 
 
 def test_tables_that_came_later_are_empty(older):
@@ -209,24 +209,4 @@ def test_an_older_file_is_copied_and_added_to(older, tmp_path):
         recording.append("height", height)
     for path, count in ((older, 1), (tmp_path / "copy.uwb", 0)):
         with Recording.open(path) as recording:
-            assert recording.tags()[0].body == "drone"
-            assert recording.count("height") == count
-
-
-def test_a_table_that_was_always_there_is_missed(older):
-    with duckdb.connect(str(older)) as db:
-        db.execute("DROP TABLE poses")
-    with pytest.raises(RecordingError, match="table poses lacks"):
-        Recording.open(older)
-
-
-@pytest.mark.parametrize("table", LATER)
-def test_a_table_that_came_later_came_whole(tmp_path, table):
-    path = tmp_path / "f.uwb"
-    with Recording.create(path):
-        pass
-    column = list(TABLES[table])[-1]
-    with duckdb.connect(str(path)) as db:
-        db.execute(f"ALTER TABLE {table} DROP COLUMN {column}")
-    with pytest.raises(RecordingError, match=f"table {table} lacks {column}"):
-        Recording.open(path)
+            assert (recording.tags()[0].body, recording.count("height")) == ("drone", count)

@@ -1,37 +1,26 @@
 """Files from strangers: what is a program in them is refused before it runs, what is too much before it is read."""
 
 import json
-import shutil
 import threading
 
 import duckdb
 import pytest
 
 from tests.errors import one_line
+from tests.uwblink.recording.test_file import change, random_exchanges
 from uwblink.errors import RecordingError
 from uwblink.exporters import export_recording
 from uwblink.recording import store
+from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Tag
 
 
-@pytest.fixture(scope="module")
-def sound(tmp_path_factory):
-    path = tmp_path_factory.mktemp("sound") / "sound.uwb"
-    with Recording.create(path) as recording:
-        recording.append_tags([Tag(1, "drone", (0.0, 0.0, 0.0))])
-    return path
-
-
 @pytest.fixture
-def file(sound, tmp_path):
-    return shutil.copyfile(sound, tmp_path / "stranger.uwb")
-
-
-def change(path, *statements):
-    with duckdb.connect(str(path)) as db:
-        for statement in statements:
-            db.execute(statement)
+def file(tmp_path):
+    tags = [Tag(1, "drone", (0.0, 0.0, 0.0))]
+    Contents(exchanges=random_exchanges(0), tags=tags).save(tmp_path / "stranger.uwb")
+    return tmp_path / "stranger.uwb"
 
 
 HUGE = "SELECT 'k' AS key, 'v' AS value FROM range(10000000000)"
@@ -131,8 +120,7 @@ def test_a_writer_writes_nowhere_but_beside_the_recording(tmp_path):
 
 def test_more_rows_than_a_file_can_hold_are_not_read(file, monkeypatch):
     change(file, "INSERT INTO height SELECT 0, 'drone', 1.0 FROM range(3000000)")
-    size = file.stat().st_size
-    assert size < 2_000_000  # three million rows that are all alike take no place
+    assert file.stat().st_size < 2_000_000, "three million rows that are all alike take no place"
     with Recording.open(file) as recording:
         assert recording.count("height") == 3_000_000
     monkeypatch.setattr(store, "ROWS_OF_ANY_FILE", 2_000_000)

@@ -11,10 +11,11 @@ from rich.console import Console
 import calib
 import uwblink
 from calib.checks.examine import examine
-from tests.boards import bench_scenario
+from tests.boards import bench_scenario, record_bench
 from tests.uwblink.recording.test_file import random_exchanges
 from uwblink.boards.listeners import ReportCheck
 from uwblink.cli.commands import print_summary
+from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Tag
 from uwblink.recording.summary import (
@@ -25,7 +26,7 @@ from uwblink.recording.summary import (
     skew_summary,
     summarize,
 )
-from uwblink.twr import COLUMNS, Exchanges
+from uwblink.twr import COLUMNS, STAMPS, Exchanges
 from uwblink.wire.messages import RangeReport, TargetRangeReport
 from uwbsim.boards.virtual_board import VirtualPorts
 
@@ -41,33 +42,27 @@ def summary(tmp_path):
 
 
 def test_counts_add_up(summary):
-    assert summary.counts["exchanges"] == 50 == sum(p.exchanges for p in summary.pairs)
-    assert sum(summary.protocols.values()) == 50
-    assert summary.faults == {"time-out": 2}
+    by_pair, by_protocol = sum(p.exchanges for p in summary.pairs), sum(summary.protocols.values())
+    assert (summary.counts["exchanges"], by_pair, by_protocol, summary.faults) == (50, 50, 50, {"time-out": 2})
     assert summary.to_dict()["tags"] == [{"tag": 3, "body": "b", "lever_arm_m": [0.1, 0.2, 0.3]}]
 
 
 def test_printed_text_from_a_file_cannot_format_or_steer_the_terminal(summary):
     out = io.StringIO()
     print_summary(summary, Console(file=out, width=100, force_terminal=True, color_system=None))
-    assert "[bold]x[/]" in out.getvalue()
-    assert "\x1b[31m" not in out.getvalue()
+    assert ("[bold]x[/]" in out.getvalue(), "\x1b[31m" in out.getvalue()) == (True, False)
 
 
 def test_a_summary_fits_on_a_screen_and_cannot_steer_it(tmp_path):
-    with Recording.create(tmp_path / "\x1b[2J.uwb") as r:
-        r.append_exchanges(random_exchanges(500))
-        r.append_tags([Tag(k, "\x1b[31m" + "b" * 200, (0.0, 0.0, 0.0)) for k in range(40)])
-        r.append("faults", [Fault(k, "1", f"kind {k}" * 10, "", 1, 2) for k in range(40)])
+    tags = [Tag(k, "\x1b[31m" + "b" * 200, (0.0, 0.0, 0.0)) for k in range(40)]
+    faults = [Fault(k, "1", f"kind {k}" * 10, "", 1, 2) for k in range(40)]
+    Contents(exchanges=random_exchanges(500), tags=tags, faults=faults).save(tmp_path / "\x1b[2J.uwb")
     with Recording.open(tmp_path / "\x1b[2J.uwb") as r:
         summary = r.show()
-    lines = str(summary).splitlines()
-    assert len(lines) <= 24
-    assert max(map(len, lines)) <= 79
-    assert "500 exchanges in" in lines[0]
-    assert "\x1b" not in str(summary) + summary._repr_html_()
-    assert repr(summary) == str(summary)
-    assert "<td>" in summary._repr_html_()
+    text, html = str(summary), summary._repr_html_()
+    lines = text.splitlines()
+    assert (len(lines) <= 24, max(map(len, lines)) <= 79, "500 exchanges in" in lines[0]) == (True, True, True), text
+    assert ("\x1b" in text + html, repr(summary) == text, "<td>" in html) == (False, True, True)
 
 
 def test_failures_are_counted_by_the_ends_of_the_exchange_whatever_the_text_says():
@@ -97,13 +92,9 @@ def exchanges(protocol, sign=1.0, carriers=True, warmer_ppm=0.0):
     def stamp(tag, after):
         return np.rint((begin + after) * (1 + fast[tag] * 1e-6) * TICKS).astype(np.int64)
 
-    t2, t3 = 1e-8, 3e-4
-    t4 = t3 + 1e-8
-    columns = {"tx1": stamp(first, 0), "rx1": stamp(second, t2), "tx2": stamp(second, t3), "rx2": stamp(first, t4)}
-    sender, receiver = (second, first) if protocol == "ds" else (first, second)
-    t5 = 2e-3
-    columns |= {"tx3": stamp(sender, t5), "rx3": stamp(receiver, t5 + 1e-8)}
-    columns = {name: values % 2**32 for name, values in columns.items()}
+    ends = [first, second, second, first, *((second, first) if protocol == "ds" else (first, second))]
+    after_s = (0, 1e-8, 3e-4, 3e-4 + 1e-8, 2e-3, 2e-3 + 1e-8)
+    columns = {name: stamp(tag, after) % 2**32 for name, tag, after in zip(STAMPS, ends, after_s, strict=True)}
     relative = fast[second] - fast[first]
     skews = {"skew1_ppm": sign * relative, "skew2_ppm": -sign * relative} if carriers else {}
     return Exchanges.from_arrays(first, second, **columns, **skews, protocol=np.full(len(pairs), protocol))
@@ -114,12 +105,11 @@ def test_both_see_what_was_planted(protocol):
     found = {one.pair: one for one in clock_skews(exchanges(protocol))}
     assert sorted(found) == ["1-2", "1-3", "2-3"]
     for pair, planted in {"1-2": 6.0, "1-3": -2.5, "2-3": -8.5}.items():
+        one = found[pair]
         # A tick in two milliseconds is 0.008 ppm.
-        assert found[pair].stamps_ppm == pytest.approx(planted, abs=0.01)
-        assert found[pair].carrier_ppm == pytest.approx(planted, abs=1e-9)
-        assert found[pair].slope == pytest.approx(1, abs=0.01)
-        assert found[pair].residual_ppm == pytest.approx(0, abs=1e-9)
-        assert found[pair].same_sign is True
+        assert (one.stamps_ppm, one.slope) == pytest.approx((planted, 1), abs=0.01)
+        assert (one.carrier_ppm, one.residual_ppm) == pytest.approx((planted, 0), abs=1e-9)
+        assert one.same_sign is True
     assert skew_summary(list(found.values())) == "carriers over stamps 1.000, residual 0.00 ppm, same sign"
 
 
@@ -155,9 +145,9 @@ def both(tmp_path_factory):
     """The same five seconds of three boards, targets reporting too, and not."""
     folder = tmp_path_factory.mktemp("reports")
     for name, target_reports in (("both", True), ("one", False)):
-        ports = VirtualPorts(bench_scenario(), lost_share=0.1)
         plan = uwblink.RangingPlan(rate_hz=60.0, target_reports=target_reports)
-        uwblink.record(ports.names.values(), folder / f"{name}.board.uwb", plan, duration_s=5.0, using=ports)
+        lossy = VirtualPorts(bench_scenario(), lost_share=0.1)
+        record_bench(folder / f"{name}.board.uwb", plan, lossy, duration_s=5.0)
         exchanges = exchanges_of(folder / f"{name}.board.uwb")
         assert len(exchanges) > 200
         measured = replace(exchanges, truth_m=np.full(len(exchanges), 3.0))
@@ -171,22 +161,15 @@ def rewritten(source, output, exchanges):
 
 
 def exchanges_of(path):
-    with Recording.open(path) as recording:
-        return recording.exchanges()
-
-
-def joined(one, two):
-    columns: dict[str, Any] = {n: np.concatenate([getattr(one, n), getattr(two, n)]) for n in COLUMNS}
-    return replace(one, **columns)
+    return uwblink.load(path).exchanges
 
 
 def test_each_exchange_is_left_once(both):
     exchanges = exchanges_of(both / "both.uwb")
     found = single_reports(exchanges)
-    stamps = set(zip(exchanges.tx1.tolist(), exchanges.rx2.tolist(), strict=True))
-    assert len(found.exchanges) == len(stamps)
-    assert found.repeated == len(exchanges) - len(stamps) > 150
-    assert len(found.differing) == 0
+    count = len(set(zip(exchanges.tx1.tolist(), exchanges.rx2.tolist(), strict=True)))
+    assert (len(found.exchanges), len(found.differing)) == (count, 0)
+    assert found.repeated == len(exchanges) - count > 150
     mine = found.exchanges.reporter == found.exchanges.initiator
     assert mine.all(), "every target's report follows one of the initiator's"
     one = exchanges_of(both / "one.uwb")
@@ -195,12 +178,9 @@ def test_each_exchange_is_left_once(both):
 
 def test_a_target_s_report_stands_where_the_initiator_s_is_missing(both):
     exchanges = exchanges_of(both / "both.uwb")
-    by_target = np.flatnonzero(exchanges.reporter == exchanges.target)
-    first = by_target[0]
-    twin = np.flatnonzero((exchanges.tx1 == exchanges.tx1[first]) & (exchanges.reporter == exchanges.initiator))[0]
-    kept = np.ones(len(exchanges), dtype=bool)
-    kept[twin] = False
-    found = single_reports(exchanges[kept])
+    first = np.argmax(exchanges.reporter == exchanges.target)
+    twin = (exchanges.tx1 == exchanges.tx1[first]) & (exchanges.reporter == exchanges.initiator)
+    found = single_reports(exchanges[~twin])
     assert len(found.exchanges) == len(single_reports(exchanges).exchanges)
     assert np.count_nonzero(found.exchanges.reporter == found.exchanges.target) == 1
 
@@ -211,18 +191,17 @@ def test_a_difference_is_found_whichever_number_it_is_in(both, name):
     row = np.flatnonzero(exchanges.reporter == exchanges.target)[7]
     column = getattr(exchanges, name).copy()
     column[row] += 1
-    found = single_reports(replace(exchanges, **{name: column}))
-    assert len(found.differing) == 1
-    assert found.differing[0, 1] == row
-    (told,) = differences(replace(exchanges, **{name: column}), *found.differing[0])
-    assert told == f"{name} {column[found.differing[0, 0]]} and {column[row]}"
+    changed = replace(exchanges, **{name: column})
+    ((first, second),) = single_reports(changed).differing
+    assert second == row
+    assert differences(changed, first, second) == [f"{name} {column[first]} and {column[row]}"]
 
 
 def test_equal_stamps_of_another_time_are_another_exchange(both):
     exchanges = single_reports(exchanges_of(both / "both.uwb")).exchanges
     later = replace(exchanges, reporter=exchanges.target, time_ns=exchanges.time_ns + 70_000_000)
-    found = single_reports(joined(exchanges, later))
-    assert found.repeated == 0
+    columns: dict[str, Any] = {n: np.concatenate([getattr(exchanges, n), getattr(later, n)]) for n in COLUMNS}
+    assert single_reports(replace(exchanges, **columns)).repeated == 0
 
 
 def test_show_calibration_and_doctor_count_it_once(both):
@@ -232,8 +211,7 @@ def test_show_calibration_and_doctor_count_it_once(both):
         failed = sum("failed" in fault.kind for fault in recording.faults())
     assert summary.counts["exchanges"] == sum(p.exchanges for p in summary.pairs) == len(exchanges)
     assert sum(p.failed for p in summary.pairs) == failed > 0
-    assert summary.reported_twice > 150
-    assert summary.contradictory == 0
+    assert (summary.reported_twice > 150, summary.contradictory) == (True, 0)
     assert len(calib.load_ranges(both / "both.uwb")) == len(exchanges)
     assert not any("contradicting" in finding.fault for finding in examine(both / "both.uwb"))
 
@@ -259,13 +237,16 @@ def as_target(report, **changes):
 
 def test_a_recorder_compares_the_two_reports_as_they_come():
     check = ReportCheck()
-    assert check.add(1, REPORT) is None
-    assert check.add(2, as_target(REPORT)) is None
-    assert check.add(1, REPORT) is None
-    told = check.add(2, as_target(REPORT, range_m=3.5, rx3=601))
-    assert told == "boards 1 and 2 report one exchange of 1 with 2 differently: range_m 3.0 and 3.5, rx3 600 and 601"
+    told = "boards 1 and 2 report one exchange of 1 with 2 differently: range_m 3.0 and 3.5, rx3 600 and 601"
     # The report of one that was lost is not compared with that of the next.
     later = RangeReport(2, 3.1, 107, 207, 307, 407, 507, 607, -80.0, -81.0, 1.0, -1.0)
-    assert check.add(1, REPORT) is None
-    assert check.add(2, as_target(later)) is None
-    assert check.add(1, later) is None
+    for board, report, expected in (
+        (1, REPORT, None),
+        (2, as_target(REPORT), None),
+        (1, REPORT, None),
+        (2, as_target(REPORT, range_m=3.5, rx3=601), told),
+        (1, REPORT, None),
+        (2, as_target(later), None),
+        (1, later, None),
+    ):
+        assert check.add(board, report) == expected

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -83,12 +84,7 @@ def test_a_viewer_gets_a_topic_a_pair_with_its_schema():
     assert content["timestamp"] == {"sec": 1_706_822_508, "nsec": 42_560_815}
     assert (content["corrected_m"], content["sigma_m"], content["clamped"]) == (3.0, 0.03, False)
     assert "fpp2_dbm" not in content, "JSON has no word for what was not measured"
-    kinds: dict[str, type | tuple[type, ...]] = {
-        "integer": int,
-        "number": (int, float),
-        "boolean": bool,
-        "object": dict,
-    }
+    kinds: dict[str, Any] = {"integer": int, "number": (int, float), "boolean": bool, "object": dict}
     for name, value in content.items():
         assert isinstance(value, kinds[schema["properties"][name]["type"]]), name
 
@@ -175,9 +171,8 @@ def test_a_port_that_is_taken_and_a_missing_extra_are_said(monkeypatch):
 def test_a_range_is_at_somebody_else_s_20_ms_after_its_poll(ear):
     """By the boards' own time, so that no other work of this machine counts; docs/boards.md has the figures."""
     ports, late_ms = VirtualPorts(bench_scenario()), []
-    names = list(ports.names.values())
     with UdpSender(str(ear.getsockname()[1])) as sender:
-        for found in uwblink.stream(names, duration_s=1.0, using=ports):
+        for found in uwblink.stream(list(ports.names.values()), duration_s=1.0, using=ports):
             assert isinstance(found, uwblink.StreamedRange)
             sender.send(found)
             row = json.loads(ear.recv(65536))
