@@ -450,7 +450,7 @@ def test_delays_without_standard_errors_are_not_taken_for_exact(seeds, tmp_path)
     assert (found["verdict"], found["probability"], set(found["std_ns"].values())) == ("unknown", None, {None})
     assert found["difference_ns"]["2"] - found["difference_ns"]["1"] == pytest.approx(0.3)
     for line, told in (
-        (words, "no verdict"),
+        (words, "not tested"),
         (("calib", "show", "c.json"), "not stated"),
         (("calib", "export", "c.json", "--to", "csv"), ",\n"),
     ):
@@ -494,7 +494,7 @@ def test_a_twin_does_without_exchanges_of_a_tag_with_itself(tmp_path):
 def test_delays_of_all_tags_and_no_curve_blame_the_calibration(seeds):
     for known, said in (
         ({"delays_from": seeds / "c.json"}, "`delays_from`: it has the delays of all tags"),
-        ({"fixed_ns": {1: 0.0, 2: 0.0, 3: 0.0}}, "`fixed_ns`: every tag is pinned"),
+        ({"fixed_ns": {1: 0.0, 2: 0.0, 3: 0.0}}, "`fixed_ns`: all delays are known"),
     ):
         with pytest.raises(calib.BadInputError, match=said):
             calib.fit(calib.sample_flight(COUNT), **known, delays_only=True)

@@ -160,8 +160,8 @@ def test_entry_points_are_loaded_once_and_only_when_they_are_needed(table):
     with pytest.warns(PluginWarning) as caught:
         assert list(registry) == ["own", "one", "two", "three"]
     expected = (
-        "'one': is registered already",
-        "'own': is one of the project's own",
+        "'one': is already registered",
+        "'own': this name is reserved",
         "row: found 'text', expected a Row",
         "AttributeError: ",
     )

@@ -25,9 +25,9 @@ def test_ranges_without_stamps_are_those_of_a_table_without_stamps(tmp_path):
     for name in COLUMNS:
         np.testing.assert_array_equal(getattr(mine, name), getattr(table, name), err_msg=name)
     cases: tuple[tuple[dict[str, Any], str], ...] = (
-        ({"tx1": [3], "range_m": [3.1]}, "rx1: is not given"),
-        ({"rx1": [3], "range_m": [3.1]}, "tx1: is not given"),
-        ({}, "tx1: is not given; give the stamps, or range_m"),
+        ({"tx1": [3], "range_m": [3.1]}, "rx1: is missing"),
+        ({"rx1": [3], "range_m": [3.1]}, "tx1: is missing"),
+        ({}, "tx1: is missing; give the stamps, or range_m"),
     )
     for columns, said in cases:
         with pytest.raises(ArgumentError, match=said):

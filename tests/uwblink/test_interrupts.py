@@ -68,7 +68,7 @@ def test_a_sweep_says_that_what_was_done_is_kept_and_goes_on_with_it(tmp_path):
     process = started("uwbsim", "sweep", str(plan), "-o", str(results), "--workers", "1")
     wait_for(lambda: (results / "results.duckdb.wal").exists() or len(files(results)) > 0, process)
     out, _ = ended(process)
-    told = "interrupted; what was done is kept, and --resume goes on with it"
+    told = "interrupted; finished runs are kept, and --resume continues"
     assert (process.returncode, told in out) == (130, True)
     assert not (results / "results.duckdb.wal").exists(), "the store is closed"
     assert not (results / "results.csv").exists(), "which is written when all is done"

@@ -23,8 +23,8 @@ def test_no_output_is_written_over_another_or_over_what_is_read(tmp_path):
     a, b = tmp_path / "a", tmp_path / "b"
     check_apart({"output": a, "pdf": b, "figures": None}, [tmp_path / "c"])
     for outputs, sources, said in (
-        ({"output": a, "pdf": tmp_path / "x" / ".." / "a"}, [], "`pdf`: .*a: is what `output` names already"),
-        ({"output": a}, [b, a], "`output`: .*a: is what is read"),
+        ({"output": a, "pdf": tmp_path / "x" / ".." / "a"}, [], "`pdf`: .*a: is also the output of `output`"),
+        ({"output": a}, [b, a], "`output`: .*a: is also an input"),
     ):
         with pytest.raises(ArgumentError, match=said):
             check_apart(outputs, sources)

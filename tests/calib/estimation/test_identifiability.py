@@ -67,7 +67,7 @@ def test_ranges_between_two_sides_are_corrected_and_others_refused_by_name(tmp_p
 @pytest.mark.parametrize("pairs", [[(1, 2)], [(1, 3), (1, 7), (2, 3), (2, 7)]], ids=["a pair", "sides"])
 def test_curves_fitted_after_delays_leave_the_same_sides_undetermined(pairs):
     some = among(ranges(4000, noise_m=0.03), pairs)
-    together, after = (fit(some, sequential=sequential).calibration for sequential in (False, True))
+    together, after = (calib.fit(some, sequential=sequential).calibration for sequential in (False, True))
     assert after.undetermined_splits == together.undetermined_splits
     apart = after.apply(some).corrected_m - together.apply(some).corrected_m
     assert np.sqrt(np.mean(apart**2)) < 0.005

@@ -91,6 +91,7 @@ def test_noise_is_larger_by_the_share_that_other_unknowns_use_up():
     error = 0.04 * rng.normal(size=count) + reflected * (0.02 + rng.exponential(0.3, count))
     parts = [Part(parameter=kind, kind=kind, columns=one) for kind in kinds]
     rows = RangeRows.of(error, np.zeros(count, dtype=np.int64), parts, Mixture(), layout)
+    noise = rows.values(layout.start(), ("noise",))["noise"]
     plain, used = (
         sum_rows([replace(rows, unsure_m2=share * np.exp(2 * noise))], layout.start()).gradient[
             layout.where["noise"].start

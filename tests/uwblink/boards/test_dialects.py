@@ -142,7 +142,7 @@ def test_another_form_ends_with_a_line_and_no_file(tmp_path):
             ("--dialect arduino", [port, "no range in", "hello 1", "dialect"]),
             ("--dialect nonsense", ["--dialect", "dwm1001-lec"]),
             ("--dialect arduino --pairs all", ["--pairs", "--dialect"]),
-            ("--dialect arduino --ids 1,2", ["1 ports and 2 ids"]),
+            ("--dialect arduino --ids 1,2", ["1 ports, but 2 ids"]),
         ):
             record = ("uwblink", "record", port, "--duration", "30", "-o", "r.uwb")
             refuse(*record, *words.split(), cwd=tmp_path, naming=naming)

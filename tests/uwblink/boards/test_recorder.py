@@ -164,7 +164,7 @@ def test_two_boards_with_one_id_and_absent_ports_are_refused_before_anything_is_
         for ports, plan, name, error, said in (
             ([first, two.names[1]], RangingPlan(), "f.uwb", PlanError, "both have the id 1"),
             ([first, "/dev/nothing"], RangingPlan(), "f.uwb", PortMissingError, "no such port"),
-            ([first, second], RangingPlan(((1, 9),)), "f.uwb", PlanError, "names 9"),
+            ([first, second], RangingPlan(((1, 9),)), "f.uwb", PlanError, "contains 9"),
             ([first, second], RangingPlan(), "mine.uwb", RecordingExistsError, None),
         ):
             with pytest.raises(error, match=said):

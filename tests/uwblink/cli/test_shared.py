@@ -65,7 +65,7 @@ def test_numbers_beyond_numbers_are_an_error_and_not_a_result(capsys):
         warnings.simplefilter("default")
         run_as_command(fail)
     out, err = capsys.readouterr()
-    told = err.startswith("error: numbers beyond what can be computed with (overflow")
+    told = err.startswith("error: numbers are too large for the computation (overflow")
     assert (end.value.code, out, told) == (2, "", True)
 
 

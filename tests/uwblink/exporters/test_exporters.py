@@ -69,8 +69,8 @@ def test_what_cannot_be_exported_leaves_nothing(whole, tmp_path):
         (ArgumentError, "`to`: found 'xls', allowed: csv, parquet, tum, mcap, rosbag2", whole, "out", "xls", False),
         (RecordingMissingError, "no such recording", tmp_path / "no.uwb", "out", "csv", False),
         (RecordingError, "does not exist", whole, "no/out", "csv", False),
-        (RecordingExistsError, "exists already", whole, "there", "csv", False),
-        (RecordingError, "holds mine", whole, "there", "csv", True),
+        (RecordingExistsError, "already exists", whole, "there", "csv", False),
+        (RecordingError, "contains mine", whole, "there", "csv", True),
     ):
         with pytest.raises(error, match=said):
             export_recording(path, tmp_path / out, to=to, force=force)

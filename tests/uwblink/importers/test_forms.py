@@ -334,7 +334,7 @@ def test_a_form_comes_in_by_its_guess(tmp_path, name):
     assert {named.get(str(n), str(n)) for n in set(e.initiator.tolist())} == {"7"}
     assert list(e.time_ns) == sorted(e.time_ns)
     notes = " ".join(found.meta["notes"])
-    assert (form.noted in notes, "received power serves" in notes) == (True, form.powers == "rxp")
+    assert (form.noted in notes, "received power is used" in notes) == (True, form.powers == "rxp")
     assert found.meta.get("chip") == form.answers.get("chip")
 
 

@@ -194,7 +194,7 @@ def test_the_command_says_what_to_do_and_how_to_go_on(tmp_path, ids, todo):
 def test_words_for_ids_are_told_with_their_numbers(tmp_path):
     rows = [{"t_s": k, "src": chr(65 + k % 13), "dst": chr(66 + k % 13), "range_m": 3.0} for k in range(60)]
     (note,) = guessed(tmp_path, rows).meta["notes"]
-    assert re.fullmatch("14 ids are words or too large, and get numbers: A = 1, B = 2,.*, L = 12 and 2 more", note)
+    assert re.fullmatch("14 ids are words or too large, and were numbered: A = 1, B = 2,.*, L = 12 and 2 more", note)
 
 
 @pytest.mark.parametrize(
@@ -333,14 +333,14 @@ def test_differences_of_arrival_without_stamps_are_read(tmp_path, header, named,
     (tmp_path / "d.csv").write_text(f"{header}\n{rows}")
     guess = guess_map(tmp_path / "d.csv")
     assert guess.asked == (() if "tag" in header else ("at_id",))
-    assert "distance of at_id to to_id less that to from_id" in guess.text
+    assert "distance from at_id to to_id minus that to from_id" in guess.text
     found_map = load_map(mapped(tmp_path, guess.text.replace('at_id = "?"', "at_id = 9")))
     assert found_map.layout == "differences"
     assert {ours: found_map.columns[ours] for ours in named} == named
     assert {key: unit for key, unit in found_map.units.items() if key in found_map.columns} == units
     words = ("uwblink", "import", "csv", "d.csv", "--map", "map.toml", "-o", "d.uwb")
     said = processes.succeed(*words, cwd=tmp_path).stdout
-    for text in ("0 exchanges, 30 differences", "distance of at_id to to_id less that to from_id"):
+    for text in ("0 exchanges, 30 differences", "distance from at_id to to_id minus that to from_id"):
         assert text in said
     found = load(tmp_path / "d.uwb").differences
     assert [found[name].tolist() for name in ("minus", "plus", "listener")] == [[1] * 30, [2] * 30, [9] * 30]

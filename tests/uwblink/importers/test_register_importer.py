@@ -54,7 +54,7 @@ def test_python_knows_it_by_suffix_and_by_name(source, tmp_path):
 def test_without_a_map_there_is_no_option_for_one(tmp_path):
     with registered(name="plain", map_help=None):
         assert "--map" not in succeed("uwblink", "import", "plain", "--help").stdout
-        with pytest.raises(ArgumentError, match="`map_file`: importer 'plain' takes none"):
+        with pytest.raises(ArgumentError, match="`map_file`: importer 'plain' uses none"):
             import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb", importer="plain", map_file=tmp_path / "m")
 
 

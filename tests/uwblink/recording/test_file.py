@@ -139,7 +139,7 @@ def test_a_damaged_file_with_the_word_lock_in_its_path_is_damaged(recording, tmp
 @pytest.mark.parametrize("size", [100, 3 * 4096 + 16384])  # odd, and that of a database
 def test_a_table_given_for_a_recording_is_told_how_to_become_one(tmp_path, name, command, size):
     (tmp_path / name).write_bytes(b"a" * size)
-    with pytest.raises(RecordingError, match=f"{name}: is no recording yet; `uwblink import {command}` makes one"):
+    with pytest.raises(RecordingError, match=f"{name}: is not a recording; convert it with `uwblink import {command}`"):
         Recording.open(tmp_path / name)
 
 

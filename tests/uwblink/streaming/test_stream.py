@@ -114,10 +114,10 @@ def test_a_recording_of_another_protocol_and_stamp_size_is_corrected_as_apply_do
 def test_a_tag_that_is_not_calibrated_is_told_before_the_first_range(tmp_path, flown, of_two):
     with pytest.raises(ValueError, match=r"two\.json: no delay of tag 3"):
         uwblink.stream(flown, calibration=of_two)
-    with pytest.raises(PlanError, match="no delay for tag 3"):
+    with pytest.raises(PlanError, match="no delay of tag 3"):
         from_boards(calibration=of_two)
     for listener in (RangeListener(print, of_two), LivePage(tmp_path / "g.uwb", correct=load_correction(of_two))):
-        with pytest.raises(PlanError, match="no delay for tag 3"):
+        with pytest.raises(PlanError, match="no delay of tag 3"):
             record_bench(tmp_path / "g.uwb", listeners=[listener])
     assert not list(tmp_path.iterdir()), "nothing was written"
     found = list(from_boards(pairs=((1, 2),), calibration=of_two, duration_s=1.0))
