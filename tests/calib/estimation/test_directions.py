@@ -142,7 +142,7 @@ def test_a_pattern_needs_directions_and_enough_ranges():
     flown_ranges = calib.load_ranges(flown(TEN, 5)[0])
     with pytest.raises(UnanswerableError, match="no directions are known"):
         calib.fit(replace(flown_ranges, toward=np.full_like(flown_ranges.toward, np.nan)), pattern="shared")
-    with pytest.raises(UnanswerableError, match="too few ranges for a pattern, at least 960"):
+    with pytest.raises(UnanswerableError, match="too few ranges for a pattern; at least 960"):
         calib.fit(flown_ranges[:300], pattern="tag")
     assert calib.fit(flown_ranges[:300]).calibration.patterns == ()
 

@@ -85,7 +85,7 @@ def test_a_warmer_flight_is_corrected_by_its_readings(tmp_path):
     # At 18 K above the fitted mean ranges are 18 cm too long; the slope's standard error leaves 0.5 cm.
     assert judged.full.abs95_m < 0.1 < 0.2 < calib.evaluate(second, without).overall.full.abs95_m
     said = run("calib", "apply", second, "-c", tmp_path / "auto.json", "-o", tmp_path / "c.uwb").stderr
-    assert said.count("warning: tags 1, 2, 3, 4 were used more than 5 K beyond") == 1
+    assert said.count("warning: tags 1, 2, 3, 4 were used more than 5 K outside") == 1
     corrected = uwblink.load(tmp_path / "c.uwb").exchanges.range_m - calib.load_ranges(second).truth_m
     assert np.std(corrected) == pytest.approx(judged.full.std_m, abs=1e-9)
     assert "mm/K" in run("calib", "show", tmp_path / "auto.json").stdout

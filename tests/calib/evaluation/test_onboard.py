@@ -275,7 +275,7 @@ FEW = [f"anchor{k}" for k in range(4)]
             lambda _: {"imu": {}},
             {},
             UnanswerableError,
-            r"no inertial readings of drone; put imu.csv .*model constant-vel",
+            r"no inertial readings of drone; add imu.csv .*model constant-vel",
         ),
         (
             lambda flown: {"poses": flown.poses[np.flatnonzero(~np.isin(flown.poses.body, FEW))]},

@@ -332,7 +332,7 @@ def kept(imu, rows):
             lambda flown: kept(flown.imu, lambda imu: (imu["body"] != "b") | (imu["time_ns"] < NS + 10**9)),
             {},
             calib.UnanswerableError,
-            r"inertial readings of b cover -0.1 to 1.0 s .* to 2.0 s",
+            r"inertial readings of b cover -0.1 to 1.0 s .* is at 2.0 s",
         ),
         (
             lambda flown: {"poses": flown.poses[np.flatnonzero(flown.poses.body != "c")]},
@@ -373,7 +373,7 @@ def test_an_option_of_another_model_is_refused(option, used_by, tmp_path):
     for model in ("poses", "imu", "constant-velocity", "team"):
         words = "calib", "localize", "a.uwb", "-c", tmp_path / "c.json", "--model", model, *option
         said = processes.refuse(*words, naming=["c.json"] if model in used_by else used_by)
-        assert said.startswith(f"error: {option[0]}: goes with --model ") == (model not in used_by)
+        assert said.startswith(f"error: {option[0]}: can only be used with --model ") == (model not in used_by)
 
 
 def test_the_command_prints_writes_and_refuses(known, tmp_path):
