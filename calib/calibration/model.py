@@ -262,7 +262,7 @@ class Calibration:
         >>> calib.fit(ranges).calibration.correct_arrivals(ranges)
         Traceback (most recent call last):
         ...
-        calib.errors.BadInputError: memory: has no differences of arrival, because no tag overheard its ranges
+        calib.errors.BadInputError: memory: no differences of arrival, because no tag overheard these ranges
         """
         return corrected_arrivals(self, ranges)
 

@@ -121,7 +121,11 @@ def test_markers_that_are_other_radios_are_seen(starloc, tmp_path, marker_of, wr
     found = calib.examine(tmp_path / "t.uwb")
     assert {one.evidence.split()[2] for one in found if one.fault == "anchor stands elsewhere"} == wrong
     assert {"and z from delays" in one.evidence for one in found if " tag12 " in one.evidence} <= {True}
-    named = [re.findall(r"(\d+) is where (\d+)", one.evidence) for one in found if one.fault == "swapped tag ids"]
+    named = [
+        re.findall(r"(\d+) is at the given position of (\d+)", one.evidence)
+        for one in found
+        if one.fault == "swapped tag ids"
+    ]
     assert [{int(a): int(b) for a, b in one} for one in named] == [exchanged] * bool(exchanged)
     other = "swapped tag ids" if exchanged else "anchor stands elsewhere" if wrong else "reflections that last"
     assert {one.fault for one in found} == {"too few pairs", other}

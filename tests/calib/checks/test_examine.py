@@ -125,7 +125,7 @@ UNREAD = "single-sided without carrier readings"
         (SHORT, partial(planted.corrupt, share=0.01), "corrupted exchanges", ""),
         (SHORT, planted.dead, "dead or deaf tag", ""),
         (SHORT, planted.swapped_roles, "swapped roles", ""),
-        (SHORT, planted.swapped_tags, "swapped tag ids", "tag 30 is where 31 is said to be, 31"),
+        (SHORT, planted.swapped_tags, "swapped tag ids", "tag 30 is at the given position of 31, 31"),
         (SHORT, planted.turned_arms, "lever arm sign", "drone3"),
         (SHORT, planted.arms_in_mm, "lever arm unit", "0.001"),
         (SHORT, planted.wxyz, "wxyz quaternion", ""),
@@ -288,9 +288,11 @@ def test_anchors_that_were_exchanged_are_one_finding_with_the_lines_that_mend_it
     found = only(wrong, "swapped tag ids")
     some = RNG(5).permutation(4)[:count]
     exchanged = dict(zip(100 + some, 100 + np.roll(some, -1), strict=True))
-    assert {int(a): int(b) for a, b in re.findall(r"(\d+) is where (\d+)", found.evidence)} == exchanged
+    assert {
+        int(a): int(b) for a, b in re.findall(r"(\d+) is at the given position of (\d+)", found.evidence)
+    } == exchanged
     if given:
-        assert "come from" in found.remedy
+        assert "source of the true distances" in found.remedy
         return
     places = {f"anchor{row['id'] - 100}": row["position_m"] for row in lines_of(found)["anchors"]}
     for body, place in places.items():
@@ -305,7 +307,7 @@ def test_tags_of_two_robots_that_were_exchanged_are_named_with_body_and_lever_ar
     found = only(
         replace(flight, tags=[replace(by_number[other.get(k, k)], tag=k) for k in by_number]), "swapped tag ids"
     )
-    assert "tag 10 is where 21 is said to be, 21 is where 10 is said to be" in found.evidence
+    assert "tag 10 is at the given position of 21, 21 is at the given position of 10" in found.evidence
     rows = lines_of(found)["tags"]
     assert [(row["id"], row["body"], tuple(row["lever_arm_m"])) for row in rows] == [
         (k, by_number[k].body, by_number[k].lever_arm_m) for k in other

@@ -20,7 +20,7 @@ REFUSED = {
     "truth in feet": "feet",
     "88 % left out": "left out",
     "all times zero": "same time",
-    "transmissions and receptions swapped": "ranges grow",
+    "transmissions and receptions swapped": "ranges change",
     "carrier with the opposite sign": "clock skew",
     "third leg longer than a wrap": "clock skew",
 }

@@ -243,7 +243,7 @@ def test_three_quadcopters_know_where_the_others_are_and_how_well(known):
     assert figures["variance"]["accepted"] > 0.995
     text = team_text(heard, LISTEN)
     assert f"{figures['variance']['rmse_m']:.3f}" in text
-    assert "against own ranges: raw" in text
+    assert "compared with ranges only: raw" in text
 
 
 @pytest.mark.slow

@@ -64,5 +64,5 @@ def test_an_exchange_that_is_another_one_from_the_other_end_names_both():
 
 @pytest.mark.parametrize("orders", [{"1": (1, 2, 9)}, {"1": (1, 2, 2)}, {"Z": (1, 2)}])
 def test_orders_of_boards_that_are_not_there_are_refused(orders):
-    with pytest.raises(calib.BadInputError, match=r"order of boards|an arrangement"):
+    with pytest.raises(calib.BadInputError, match=r"order of boards|an unknown arrangement"):
         calib.survey(FIVE.ranges, known=calib.Knowledge(shape="line", orders=orders))

@@ -263,7 +263,7 @@ def wrong_tape():
     said = (KnownDistance(1, 3, 2.1 + 0.3, 0.005, "1"), KnownDistance(2, 4, 2.7, 0.005, "1"))
     world, text = (
         standing_boards(9, places=FOUR[:5], pair_error_m=0.01),
-        r"the known distance of 1 and 3 in 1 is \+\d+ cm",
+        r"the known distance of 1 and 3 in 1 differs from the ranges by \+\d+ cm",
     )
     return world, calib.Knowledge(shape="line", distances=said), "wrong known distance", text
 
