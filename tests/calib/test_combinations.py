@@ -3,6 +3,7 @@
 from contextlib import suppress
 from functools import cache
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ FLIGHTS = {
     "without noise": ["noiseless"],
     "patterns": [],
 }
-SETTINGS = {
+SETTINGS: dict[str, tuple[Any, ...]] = {
     "loss": ("mixture", "cauchy", "huber"),
     "lift": ("mean-of-lifted", "lift-of-mean"),
     "constants": ("pair",),
