@@ -125,3 +125,15 @@ def test_sought_anchors_do_not_spoil_what_a_known_start_tells():
     assert all(np.isinf(result.calibration.delays_std_ns[tag]) for tag in (11, 12, 13, 14))
     assert "tags 11, 12, 13, 14" in result.warnings[0]
     assert result.calibration.provenance["rests_on"]["anchors_sought"] == [f"anchor{tag}" for tag in (11, 12, 13, 14)]
+
+
+@pytest.mark.slow
+def test_noise_is_not_smaller_by_what_paths_take_of_few_ranges():
+    # 960 ranges, of which paths take an eighth: noise has a standard error of 2.5 %, the mean of three one of 1.4 %.
+    # By residuals alone it would be 6 % too small.
+    found = [
+        calib.fit_from_ranges(flight(seed=seed, rate=40), minimum_norm=True, poses_until_s=8.0, between_m=0.0)
+        for seed in (61, 62, 63)
+    ]
+    noise_m = np.mean([np.median(one.calibration.errors.noise_m) for one in found])
+    assert 0.96 < noise_m / 0.04 < 1.08
