@@ -173,6 +173,18 @@ def rare_poses(flight: Flight, rng: np.random.Generator) -> Flight:
     return replace(flight, poses=flight.poses[np.sort(np.concatenate(every))])
 
 
+def frozen_poses(flight: Flight, rng: np.random.Generator, *, bodies: int) -> Flight:
+    """Repeat the last pose of bodies for 1 to 6 s, five times."""
+    poses = flight.poses
+    position_m, quaternion = poses.position_m.copy(), poses.quaternion.copy()
+    for body in (f"drone{k + 1}" for k in range(bodies)):
+        own = np.flatnonzero(poses.body == body)
+        for start_ns in rng.uniform(poses.time_ns.min(), poses.time_ns.max(), 5):
+            lost = own[(poses.time_ns[own] > start_ns) & (poses.time_ns[own] < start_ns + rng.uniform(1e9, 6e9))]
+            position_m[lost], quaternion[lost] = position_m[lost[:1]], quaternion[lost[:1]]
+    return replace(flight, poses=replace(poses, position_m=position_m, quaternion=quaternion))
+
+
 def clock_set_back(flight: Flight, rng: np.random.Generator) -> Flight:
     """Set the host's clock back by 3 to 9 s in the middle, and sort by its times."""
     e, at_ns = flight.exchanges, np.median(flight.exchanges.time_ns)
@@ -399,6 +411,9 @@ FAULTS: Final = (
     Case("of a tag, with the wrong sign", BASE, turned_arm, names("wrong lever arm")),
     Case("its poses 0.4 to 0.8 m off", BASE, other_origin, names("body stands elsewhere")),
     Case("one in two seconds", BASE, rare_poses, names("rare poses")),
+    Case("those of a body repeat for 1 to 6 s", BASE, partial(frozen_poses, bodies=1), names("frozen poses")),
+    Case("those of all bodies do", BASE, partial(frozen_poses, bodies=3), names("frozen poses")),
+    Case("those of one among anchors do", ANCHORS, partial(frozen_poses, bodies=1), names("frozen poses")),
     Case("a clock set back", Plan(bits=40), clock_set_back, names("recordings mixed by their times")),
     Case("`rx2` rounded to 10⁷", BASE, lambda f, _: changed(f, rx2=f.exchanges.rx2 // 10**7 * 10**7),
          names("impossible stamps")),

@@ -191,6 +191,14 @@ CHECKS: Final = (
     ),
     Check(
         "geometry",
+        "Do errors spread twice as widely while the poses of a body repeat?",
+        "log of the ratio of spreads while poses repeat for 0.5 s and at other times", OVER_STRETCHES,
+        {"frozen poses": "motion capture lost the body: delete the poses that repeat the one before, and add the poses "
+         "again (uwblink poses); ranges in such gaps are left out"},
+        geometry.frozen_poses,
+    ),
+    Check(
+        "geometry",
         "Do ranges agree better with other lever arms or quaternions?",
         "log of the ratio of spreads before and after, of the best trial", f"{OVER_STRETCHES}, for all trials",
         {

@@ -23,6 +23,7 @@ from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.recording.distances import antennas_m, distances_m, find_offset, sights
 from uwblink.recording.schema import Poses, Tag
+from uwblink.twr import names_in
 
 
 def pose_clock(view: RecordingView) -> Iterator[Candidate]:
@@ -43,6 +44,38 @@ def pose_clock(view: RecordingView) -> Iterator[Candidate]:
         moved = distances_m(view.poses, view.tags, e.initiator, e.target, e.time_ns - offset_ns)
         evidence = f"with the poses {shift_s:+.3f} s later"
         yield _undone(view, Candidate("pose time offset", evidence, words={"shift": f"{shift_s:.3f}"}), moved)
+
+
+def frozen_poses(view: RecordingView) -> Iterator[Candidate]:
+    """Find times at which motion capture lost a moving body and repeated its last pose."""
+    if not view.posed:
+        return
+    e, poses = view.exchanges, view.poses[np.lexsort((view.poses.time_ns, view.poses.body))]
+    columns = np.column_stack([poses.position_m, poses.quaternion])
+    repeated = (columns[1:] == columns[:-1]).all(axis=1) & (poses.body[1:] == poses.body[:-1])
+    # Without repeated poses there is a gap, in which the places of antennas are not known.
+    fresh = poses[~np.append(False, repeated)]
+    ends, error_m = np.stack([e.initiator, e.target], axis=1), view.less_pairs(view.error_m)
+    lost = np.stack([np.isnan(antennas_m(fresh, view.tags, ids, e.time_ns)[:, 0]) for ids in ends.T], axis=1)
+    lost &= np.isfinite(error_m)[:, None]
+    rows = np.flatnonzero(lost.any(axis=1))
+    rows = rows[np.argsort(e.time_ns[rows], kind="stable")]
+    cuts, rest = stretches(len(rows), fewest=10), np.isfinite(error_m) & ~lost.any(axis=1)
+    if not cuts or not rest.any():
+        return
+    usual_m = max(robust_spread(error_m[rest], 0.0), 1e-6)
+    spread_m = np.array([max(robust_spread(error_m[rows[cut]], 0.0), 1e-6) for cut in cuts])
+    mine = {body: [tag.tag for tag in view.tags if tag.body == body] for body in names_in(poses.body)}
+    of = {body: error_m[(lost & np.isin(ends, own)).any(axis=1)] for body, own in mine.items()}
+    bodies = [body for body, errors in of.items() if len(errors) and robust_spread(errors, 0.0) > 2 * usual_m]
+    yield Candidate(
+        "frozen poses",
+        f"the poses of {', '.join(bodies)} repeat during {len(rows)} ranges, whose errors spread by "
+        f"{100 * float(np.median(spread_m)):.0f} cm instead of {100 * usual_m:.1f} cm",
+        # A body that stands still repeats its poses, too; its errors spread as at other times.
+        positive(np.log(spread_m) - np.log(2 * usual_m)),
+        gain=_gain(error_m[rows], np.full(len(rows), usual_m)),
+    )
 
 
 def _trials(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]:

@@ -134,6 +134,8 @@ UNREAD = "single-sided without carrier readings"
         (replace(SHORT, seconds=120), planted.other_origin, "body stands elsewhere", r"0\.7\d m away \(-0\.0\d, -0\.7"),
         (replace(SHORT, bits=40), planted.clock_set_back, "recordings mixed by their times", ""),
         (SHORT, planted.rare_poses, "rare poses", "drone1 by"),
+        (SHORT, partial(planted.frozen_poses, bodies=1), "frozen poses", "poses of drone1 repeat"),
+        (SHORT, partial(planted.frozen_poses, bodies=3), "frozen poses", "drone1, drone2, drone3"),
         (SHORT, columns(lambda e: {"rx2": e.rx2 // 10**7 * 10**7}), "impossible stamps", "of 3200"),
         (SHORT, late_poses(400_000_000), "pose time offset", "--offset -0.4|--offset -0.39"),
         (BRIEF, late_poses(LATE_NS), "no true distances", ""),
@@ -196,6 +198,24 @@ def test_recordings_of_scenarios_without_a_fault_have_no_finding():
     ):
         settings = {"run.duration_s": 40.0, "run.seed": 50_000} | changed
         assert faults(uwbsim.simulate(uwbsim.load(name, settings))) == expected
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_poses_that_repeat_because_the_body_stands_still_are_sound(seed):
+    flight = fly(replace(SHORT, share=0.1, lasts_s=4.0), seed)
+    frozen = planted.frozen_poses(flight, RNG(seed), bodies=1)
+    here, there = (
+        calib.Ranges.from_exchanges(one.exchanges, poses=one.poses, tags=one.tags).truth_m for one in (frozen, flight)
+    )
+    assert "frozen poses" in faults(frozen)
+    assert "frozen poses" not in faults(planted.longer(frozen, here - there))
+    # The remedy: the poses that repeat the one before are deleted.
+    poses = frozen.poses
+    kept = [
+        own[np.append(True, np.any(np.diff(poses.position_m[own], axis=0), axis=1))]
+        for own in (np.flatnonzero(poses.body == body) for body in np.unique(poses.body))
+    ]
+    assert faults(replace(frozen, poses=poses[np.sort(np.concatenate(kept))])) in ([], ["reflections that last"])
 
 
 @pytest.mark.parametrize(("plan", "seed"), [(Plan(seconds=60), 60_017), (replace(planted.ONE, seconds=60), 60_003)])
