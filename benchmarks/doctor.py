@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import calib
 from benchmarks.flights import FIRST_REPORTED, LIGHT, TICKS, Flight, Plan, fly
@@ -150,6 +151,16 @@ def wxyz(flight: Flight, rng: np.random.Generator) -> Flight:
 def inverse_attitudes(flight: Flight, rng: np.random.Generator) -> Flight:
     """Write quaternions from the world to the body."""
     return replace(flight, poses=replace(flight.poses, quaternion=flight.poses.quaternion * [-1, -1, -1, 1]))
+
+
+def turned_attitudes(flight: Flight, rng: np.random.Generator, *, body: str = "") -> Flight:
+    """Turn the attitudes in the world by 30 to 180 degrees, or those of a body about the vertical of its own frame."""
+    # About the line through its tags a body may be turned as one likes.
+    axis, given = np.array([0.0, 0.0, 1.0]) if body else rng.normal(size=3), Rotation.from_quat(flight.poses.quaternion)
+    turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(np.pi / 6, np.pi))
+    turned = (given * turn if body else turn * given).as_quat()
+    mine = (flight.poses.body == body)[:, None] | (body == "")
+    return replace(flight, poses=replace(flight.poses, quaternion=np.where(mine, turned, flight.poses.quaternion)))
 
 
 def turned_arm(flight: Flight, rng: np.random.Generator) -> Flight:
@@ -408,6 +419,9 @@ FAULTS: Final = (
     Case("lever arms of a body with the wrong sign", BASE, turned_arms, names("lever arm sign", "swapped tag ids")),
     Case("quaternions w x y z", BASE, wxyz, names("wxyz quaternion")),
     Case("from world to body", BASE, inverse_attitudes, names("inverse quaternion")),
+    Case("turned by 30 to 180 degrees in the world", BASE, turned_attitudes, names("attitudes in another frame")),
+    Case("those of a body about its vertical", BASE, partial(turned_attitudes, body="drone2"),
+         names("attitudes in another frame")),
     Case("of a tag, with the wrong sign", BASE, turned_arm, names("wrong lever arm")),
     Case("its poses 0.4 to 0.8 m off", BASE, other_origin, names("body stands elsewhere")),
     Case("one in two seconds", BASE, rare_poses, names("rare poses")),

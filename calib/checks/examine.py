@@ -207,6 +207,7 @@ CHECKS: Final = (
             "wxyz quaternion": "quaternions are w x y z: reorder the columns to x y z w",
             "inverse quaternion": "quaternions turn the world into the body: change the signs of x y z",
             "wrong lever arm": "measure the lever arm of {name} in the frame of its body; the ranges give{line}",
+            "attitudes in another frame": "{remedy}",
             "body stands elsewhere": "check that the poses of {name} have the same frame and origin as the others",
         },
         geometry.geometry,

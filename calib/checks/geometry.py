@@ -4,13 +4,15 @@ compared.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from scipy import optimize, sparse, special
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
 
 from calib.checks.fitted import distance_speeds
 from calib.checks.recording_view import QuickFit, RecordingView
@@ -18,8 +20,8 @@ from calib.estimator.known_distances import ASTRAY_M
 from calib.estimator.score_tests import Tested
 from calib.findings import BUDGET, Candidate, positive, stretches
 from calib.information import LOOSEST
-from calib.spread import medians, robust_spread
-from uwblink.arrays import Floats, Ints
+from calib.spread import less_medians, medians, robust_spread
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.recording.distances import antennas_m, distances_m, find_offset, sights
 from uwblink.recording.schema import Poses, Tag
@@ -108,9 +110,11 @@ def _displacements(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list
     ends = {name: np.stack([e.initiator == tag.tag, e.target == tag.tag], axis=1) for name, tag in arms.items()}
     sides = {name: -away_m[:, None] * np.where(own[..., None], ways, 0.0).sum(axis=1) for name, own in ends.items()}
     for name, side in (sides | _sides(view, fit, {tag.body for tag in arms.values()})).items():
-        rows, few = side.any(axis=1), np.count_nonzero(side.any(axis=1)) < 200
+        rows = side.any(axis=1)
+        if np.count_nonzero(rows) < 200:
+            continue
         shift = _place(side[rows], fit.error[rows], fit.model.pairs.number[rows], [np.zeros(3)])
-        if (size := float(np.linalg.norm(shift))) > 2 * TOLERANCE_M and not few:
+        if (size := float(np.linalg.norm(shift))) > 2 * TOLERANCE_M:
             own = {arms[name].tag: np.round(arms[name].lever_arm_m + shift, 3)} if name in arms else {}
             tags = _with_arms(view.tags, own)
             yield (
@@ -127,6 +131,71 @@ def _displacements(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list
             )
 
 
+def _turns(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]:
+    """Attitudes turned in the world, and lever arms turned in a body, as ranges fit best, each with poses and tags.
+
+    Turns that move no antenna by more than twice `TOLERANCE_M` may be antennas whose delays depend on the direction.
+    """
+    if (fit := view.quick_fit) is None:
+        return
+    every = slice(None, None, max(len(fit.rows) // 1000, 1))
+    e, pair = view.exchanges[fit.rows[every]], fit.model.pairs.number[every]
+    ends, arms = np.stack([e.initiator, e.target], axis=1), {tag.tag: np.array(tag.lever_arm_m) for tag in view.tags}
+    arm = np.array([[arms[tag] for tag in both] for both in ends.tolist()])
+    # Antennas without lever arms, and with lever arms of a metre along the axes of their bodies.
+    told = [_with_arms(view.tags, dict.fromkeys(arms, tip)) for tip in np.eye(4, 3, -1)]
+    place, *tips = (np.stack([antennas_m(view.poses, tags, ids, e.time_ns) for ids in ends.T], 1) for tags in told)
+    axes = np.stack(tips, axis=-1) - place[..., None]
+    given_m = _antennas(np.zeros(3), place, axes, arm)
+    measured_m = _apart_m(given_m) + fit.error[every]
+    for body in ("", *sorted({tag.body for tag in view.tags} - places_m(view).keys())):
+        mine = [tag.tag for tag in view.tags if tag.body == body]
+        antennas = partial(_antennas, place=place, axes=axes, arm=arm, own=np.isin(ends, mine) if body else None)
+
+        def away_m(x: Floats, antennas: Callable[[Floats], Floats] = antennas) -> Floats:
+            return _apart_m(antennas(x))
+
+        x = _best(away_m, measured_m, pair, [*AXES_EXCHANGED])
+        turn, tags, attitude = Rotation.from_rotvec(x), view.tags, view.poses.quaternion
+        if np.linalg.norm(antennas(x) - given_m, axis=2).max() <= 2 * TOLERANCE_M:
+            continue
+        if body:
+            tags = _with_arms(tags, {tag: turn.apply(arms[tag]) for tag in mine})
+            lines = "".join(_line(view, tag) for tag in tags if tag.tag in mine)
+            remedy = f"measure the lever arms in the frame of the poses of {body}; the ranges give{lines}"
+        else:
+            attitude = np.where(attitude.any(axis=1, keepdims=True), attitude, [0.0, 0.0, 0.0, 1.0])
+            attitude = (turn * Rotation.from_quat(attitude)).as_quat()
+            factor = turn.as_quat().round(3).tolist()
+            remedy = f"turn them into the frame of the positions: multiply each from the left by x y z w = {factor}"
+        what, angle = f"the lever arms of {body}" if body else "all attitudes", np.degrees(turn.magnitude())
+        axis = ((x / turn.magnitude()).round(1) + 0.0).tolist()
+        evidence = f"with {what} turned by {angle:.0f} degrees about {axis}"
+        seen = Candidate("attitudes in another frame", evidence, words={"remedy": remedy})
+        yield seen, replace(view.poses, quaternion=attitude), tags
+
+
+AXES_EXCHANGED: Final = Rotation.create_group("O").as_rotvec()
+"""Rotation vectors (24, 3) that turn the axes of a frame into each other: searches for any turn begin at the best."""
+
+
+def _apart_m(antennas_m: Floats) -> Floats:
+    """Return the distances (n,) between two antennas (n, 2, 3)."""
+    return np.asarray(np.linalg.norm(antennas_m[:, 0] - antennas_m[:, 1], axis=1))
+
+
+def _antennas(x: Floats, place: Floats, axes: Floats, arm: Floats, own: Bools | None = None) -> Floats:
+    """Return antennas (n, 2, 3) where lever arms `arm` (n, 2, 3) are turned by a rotation vector (3,).
+
+    Bodies at `place` (n, 2, 3) have `axes` (n, 2, 3, 3). Lever arms that are `own` (n, 2) are turned in their body, all
+    of them in the world where `own` is None.
+    """
+    turn = Rotation.from_rotvec(x).as_matrix()
+    inside = arm if own is None else np.where(own[..., None], arm @ turn.T, arm)
+    away = np.einsum("neij,nej->nei", axes, inside)
+    return np.asarray(place + (away @ turn.T if own is None else away))
+
+
 def _with_arms(tags: list[Tag], arms: dict[int, Floats]) -> list[Tag]:
     """Return all tags, some with other lever arms (3,)."""
     return [replace(tag, lever_arm_m=tuple(np.round(arms.get(tag.tag, tag.lever_arm_m), 4).tolist())) for tag in tags]
@@ -134,8 +203,8 @@ def _with_arms(tags: list[Tag], arms: dict[int, Floats]) -> list[Tag]:
 
 def geometry(view: RecordingView) -> Iterator[Candidate]:
     """Find the fault of geometry that explains the ranges best, by trying all suspected ones."""
-    for suspected in (_trials, _displacements) if view.posed else ():
-        e, trials = view.exchanges, list(suspected(view))
+    for suspected in ((_trials,), (_displacements, _turns)) if view.posed else ():
+        e, trials = view.exchanges, [one for some in suspected for one in some(view)]
         found = [
             _undone(view, seen, distances_m(poses, tags, e.initiator, e.target, e.time_ns), tried=len(trials))
             for seen, poses, tags in trials
@@ -426,21 +495,27 @@ def _axes(own: Tested, shift: Floats) -> tuple[str, str]:
 
 
 def _place(apart: Floats, error: Floats, pair: Ints, starts: Sequence[Floats]) -> Floats:
-    """Return the displacement (3,) that ranges ask for, beside a constant of each pair, by robust least squares.
-
-    The best of searches from several starts (3,). A thousandth of a range holds the place where ranges do not: robots
-    that move in a plane do not see its height.
-    """
+    """Return the displacement (3,) that ranges ask for, as `_best` finds it."""
     every = slice(None, None, max(len(apart) // 2000, 1))
-    apart, pair = apart[every], np.unique(pair[every], return_inverse=True)[1]
-    measured = np.linalg.norm(apart, axis=1) + error[every]
+    measured_m = np.linalg.norm(apart[every], axis=1) + error[every]
+    return _best(lambda x: np.linalg.norm(apart[every] + x, axis=1), measured_m, pair[every], starts)
+
+
+def _best(away_m: Callable[[Floats], Floats], measured_m: Floats, pair: Ints, starts: Sequence[Floats]) -> Floats:
+    """Return the unknowns (3,) of distances `away_m` (n,) by robust least squares, beside a constant of each pair.
+
+    The better of searches from zero and from the best of some starts (3,). A thousandth of a range holds unknowns at
+    zero where ranges do not: robots that move in a plane do not see the height of an anchor.
+    """
+    pair = np.unique(pair, return_inverse=True)[1]
 
     def residuals(x: Floats) -> Floats:
-        rest = measured - np.linalg.norm(apart + x[:3], axis=1) - x[3:][pair]
+        rest = measured_m - away_m(x[:3]) - x[3:][pair]
         return np.append(rest, 1e-3 * len(rest) ** 0.5 * x[:3])
 
+    spread_m = [robust_spread(less_medians(measured_m - away_m(start), pair), 0.0) for start in starts]
     found = []
-    for start in starts:
-        constants = medians(measured - np.linalg.norm(apart + start, axis=1), pair)
+    for start in (np.zeros(3), starts[int(np.argmin(spread_m))]):
+        constants = medians(measured_m - away_m(start), pair)
         found.append(optimize.least_squares(residuals, np.append(start, constants), loss="soft_l1", f_scale=0.1))
     return np.asarray(min(found, key=lambda one: one.cost).x[:3])

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import calib
 import uwbsim
@@ -131,6 +132,7 @@ UNREAD = "single-sided without carrier readings"
         (SHORT, planted.wxyz, "wxyz quaternion", ""),
         (SHORT, planted.inverse_attitudes, "inverse quaternion", "signs of x y z"),
         (SHORT, planted.turned_arm, "wrong lever arm", "lever_arm_m"),
+        (SHORT, partial(planted.turned_attitudes, body="drone2"), "attitudes in another frame", "lever_arm_m"),
         (replace(SHORT, seconds=120), planted.other_origin, "body stands elsewhere", r"0\.7\d m away \(-0\.0\d, -0\.7"),
         (replace(SHORT, bits=40), planted.clock_set_back, "recordings mixed by their times", ""),
         (SHORT, planted.rare_poses, "rare poses", "drone1 by"),
@@ -198,6 +200,20 @@ def test_recordings_of_scenarios_without_a_fault_have_no_finding():
     ):
         settings = {"run.duration_s": 40.0, "run.seed": 50_000} | changed
         assert faults(uwbsim.simulate(uwbsim.load(name, settings))) == expected
+
+
+def test_the_remedy_for_attitudes_of_another_frame_undoes_it():
+    flight, rng = fly(SHORT, 3), RNG(5)
+    turned = planted.turned_attitudes(flight, rng)
+    found = only(turned, "attitudes in another frame")
+    factor = numbers(found.remedy)[-4:]
+    given = Rotation.from_quat(turned.poses.quaternion)
+    mended = (Rotation.from_quat(factor) * given).as_quat()
+    back = replace(turned, poses=replace(turned.poses, quaternion=mended))
+    assert faults(back) == []
+    # The planted turn, to 10 degrees: a lever arm of 0.2 m then is 3.5 cm off.
+    true = Rotation.from_quat(flight.poses.quaternion)
+    assert np.degrees((Rotation.from_quat(mended) * true.inv()).magnitude()).max() < 10
 
 
 @pytest.mark.parametrize("seed", range(3))
