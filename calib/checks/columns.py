@@ -214,32 +214,32 @@ def another(view: RecordingView) -> Iterator[Candidate]:
     """
     e = view.exchanges[:: max(len(view.exchanges) // 4000, 1)]
     names, counts = np.unique(e.protocol, return_counts=True)
-    said = str(names[int(np.argmax(counts))])
+    given = str(names[int(np.argmax(counts))])
     third = bool(np.mean((e.tx3 | e.rx3) != 0) > 0.5)
     highest = max(int(stamps.max(initial=0)) for stamps in (e.tx1, e.rx1, e.tx2, e.rx2))
     tried = {
         (name, bits): _possible_share(replace(e, protocol=np.full(len(e), name), bits=bits))
         for name, row in PROTOCOLS.items()
         for bits in (32, 40)
-        if highest < 1 << bits and (name, bits) != (said, e.bits) and (row.third_sender is not None) == third
+        if highest < 1 << bits and (name, bits) != (given, e.bits) and (row.third_sender is not None) == third
     }
     if not tried:
         return
-    name, bits = max(tried, key=lambda key: (round(tried[key], 2), key[1] == e.bits, key[0] == said))
+    name, bits = max(tried, key=lambda key: (round(tried[key], 2), key[1] == e.bits, key[0] == given))
     share, own = tried[name, bits], _possible_share(e)
     # A wrong width spoils only exchanges during which the counter wraps; a wrong protocol spoils most.
-    if share < max(0.5, own + (0.01 if name == said else 0.2)):
+    if share < max(0.5, own + (0.01 if name == given else 0.2)):
         return
     numbers = f"{100 * share:.1f} % of the ranges are possible, {100 * own:.1f} % with the settings of the recording"
-    if name == said:
+    if name == given:
         yield Candidate("timestamp width", f"as {bits}-bit stamps {numbers}", words={"bits": bits})
     else:
-        alike = [n for n in PROTOCOLS if tried.get((n, bits), 0.0) > share - 0.01 and n not in (said, name)]
+        alike = [n for n in PROTOCOLS if tried.get((n, bits), 0.0) > share - 0.01 and n not in (given, name)]
         also = f" (or {' or '.join(alike)})" if alike else ""
         width, setting = (f" with {bits} bits", f", bits = {bits}") if bits != e.bits else ("", "")
         yield Candidate(
             "another protocol",
-            f"read as {name}{also}{width} {numbers} ({said})",
+            f"read as {name}{also}{width} {numbers} ({given})",
             words={"settings": f'protocol = "{name}"{setting}'},
         )
 

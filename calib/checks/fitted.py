@@ -70,11 +70,11 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
     for one in tested:
         if one.family.kind in ("pair", "session") and not len(one.family.fitted):
             plain = plain + widening(one)
-    places_ns2, said = np.zeros_like(plain), list[str]()
+    places_ns2, of_places = np.zeros_like(plain), list[str]()
     if not alone and found.model.curve is not None:
         pairs = next(one for one in tested if one.family.kind == "pair")
-        places_ns2, said = place_covariance(found, slopes, pairs, plain)
-    covariance, sentences = _covariance_and_sentences(plain, findings, places_ns2, said)
+        places_ns2, of_places = place_covariance(found, slopes, pairs, plain)
+    covariance, sentences = _covariance_and_sentences(plain, findings, places_ns2, of_places)
     # Few pairs determine the size of their offsets poorly. Variance that findings added already is not added again.
     optimum = found.searches[0].optimum
     few_ns2 = of_few_draws(optimum, optimum.layout.indices(["delay"]))
@@ -247,7 +247,7 @@ def _covariance_and_sentences(
     if of_places:
         # Offsets of pairs are then random like the others; a single one is not a separate fault.
         findings = [one for one in findings if one.kind != "pair"]
-    covariance, matter, said = plain + places_ns2, dict[tuple[str, tuple[str, ...]], FoundOffset](), of_places
+    covariance, matter, places = plain + places_ns2, dict[tuple[str, tuple[str, ...]], FoundOffset](), of_places
     for one in findings:
         moved, large = _largest_shift(one, plain), abs(one.offset_m) > SMALLEST_M
         # True distances of another time or scale change ranges, but hardly delays.
@@ -256,7 +256,7 @@ def _covariance_and_sentences(
             covariance = covariance + one.spread_ns2
         if cause and "late" in one.names:
             # Then ranges between two bodies are wrong together, too: the more specific cause is named.
-            said = []
+            places = []
         large = large or (moved > CLEARLY and one.largest_ns > SMALLEST_NS)
         # With noise of power readings the curve is right for the powers as read.
         if one.kind != "readings" and (cause or (moved > MATTERS and large)):
@@ -266,7 +266,7 @@ def _covariance_and_sentences(
     if any(one.kind == "readings" for one in findings):
         noise = "; or the powers are noisy, which has the same effect: turn the antennas while recording"
     return covariance, [
-        *(sentence + noise for sentence in said),
+        *(sentence + noise for sentence in places),
         *(sentence_of(one) + noise * (one.kind == "shared") for one in matter.values()),
     ]
 
@@ -369,8 +369,8 @@ def _persistence_warning(found: KnownDistances) -> Iterator[str]:
 
 def _redundancy_warning(model: RangeModel) -> Iterator[str]:
     """Return a sentence if there are so few pairs that offsets of pairs cannot be separated from delays."""
-    count, told = len(model.pairs.ends), any(unknown.kind == "offset of pair" for unknown in model.unknowns)
-    if model.settings.constants == "tag" and count > 2 and not told:
+    count, fitted = len(model.pairs.ends), any(unknown.kind == "offset of pair" for unknown in model.unknowns)
+    if model.settings.constants == "tag" and count > 2 and not fitted:
         slopes = 0.5 * METRES_A_NS * free_ends(model.pairs, model.tags, model.settings)
         moved_ns = TYPICAL_OFFSET_M * float(np.linalg.norm(np.linalg.pinv(slopes), axis=1).max())
         yield (

@@ -175,11 +175,11 @@ def anchors(view: RecordingView) -> Iterator[Candidate]:
         yield from (replace(one, evidence=f"by the poses, {one.evidence}") for one in by_poses)
 
 
-def _with_truth(view: RecordingView, **said: Any) -> RecordingView:
+def _with_truth(view: RecordingView, **changes: Any) -> RecordingView:
     """Return a view with other poses or tags, and true distances by them."""
-    told, e = replace(view, **said), view.exchanges
-    truth_m = distances_m(told.poses, told.tags, e.initiator, e.target, e.time_ns)
-    return replace(told, ranges=replace(view.ranges, truth_m=truth_m))
+    changed, e = replace(view, **changes), view.exchanges
+    truth_m = distances_m(changed.poses, changed.tags, e.initiator, e.target, e.time_ns)
+    return replace(changed, ranges=replace(view.ranges, truth_m=truth_m))
 
 
 def _line(view: RecordingView, tag: Tag, away_m: Floats | float = 0.0) -> str:
@@ -209,9 +209,11 @@ def _exchanged(view: RecordingView, fit: QuickFit) -> tuple[dict[int, int], Cand
         mended, moved = view.ranges.truth_m.copy(), at != right
         for (a, c), own in rows.items():
             mended[fit.rows[own]] = truth_m(own, rows.get((at[a], at[c]), own))
-        said = [f"{a} is at the given position of {b}" for a, b in zip(numbers[moved], numbers[at[moved]], strict=True)]
+        texts = [
+            f"{a} is at the given position of {b}" for a, b in zip(numbers[moved], numbers[at[moved]], strict=True)
+        ]
         return _with_spreads(
-            view, Candidate("swapped tag ids", f"tag {', '.join(said)}: undone"), mended, tried=count**2
+            view, Candidate("swapped tag ids", f"tag {', '.join(texts)}: undone"), mended, tried=count**2
         )
 
     known, spread, worse = sums = np.zeros((3, count, count))
@@ -264,12 +266,12 @@ def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
             away[body] = _place(sides[body][mine], error_m, fit.model.pairs.number[mine], starts)
             there_m = np.where(poses.body[:, None] == body, poses.position_m + away[body], poses.position_m)
             poses = replace(poses, position_m=there_m)
-    if not away or (moved := (told := _with_truth(view, poses=poses)).quick_fit) is None:
+    if not away or (moved := (changed := _with_truth(view, poses=poses)).quick_fit) is None:
         return
     # Information of ranges on the other places, which they fit.
-    tested = moved.test_constants(_decrease_by_motion(_vectors_to_bodies(told, moved, places)))
+    tested = moved.test_constants(_decrease_by_motion(_vectors_to_bodies(changed, moved, places)))
     at_other = _by_body(_after_offsets_of_pairs(tested, len(moved.model.pairs.names)), sides)
-    before_m, after_m = (one.less_pairs(one.error_m)[fit.rows] for one in (view, told))
+    before_m, after_m = (one.less_pairs(one.error_m)[fit.rows] for one in (view, changed))
     for body, there in away.items():
         own, mine = at_other[body], sides[body].any(axis=1)
         # The last step is from the fit whose slopes are tested.
@@ -368,16 +370,16 @@ def beside_places(view: RecordingView, fit: QuickFit, pairs: Sequence[int]) -> t
     if not sides:
         return offsets, []
     together = _after_offsets_of_pairs(tested.with_fitted(pairs), count)
-    each, said, lines = _by_body(together, sides), list[str](), list[str]()
+    each, away, lines = _by_body(together, sides), list[str](), list[str]()
     # The anchors that are displaced for any positions of the others, or otherwise all.
     alone = [body for body, own in each.items() if _p_of_place(own, own.total) < BUDGET] or [*sides]
     for body in alone:
         shift = -_step(each[body])
-        said.append(f"{body} {_axes(each[body], shift)[0]}")
+        away.append(f"{body} {_axes(each[body], shift)[0]}")
         lines += [_line(view, tag, shift) for tag in view.tags if tag.body == body]
     seen = Candidate(
         "places that do not close",
-        f"ranges contradict the positions of {', '.join(sides)} together; the best displacements are {'; '.join(said)}",
+        f"ranges contradict the positions of {', '.join(sides)} together; the best displacements are {'; '.join(away)}",
         _p_of_place(together, together.total),
         {"lines": "".join(lines)},
     )

@@ -49,10 +49,10 @@ class Kept:
         are those of Student's t with as many degrees of freedom as a pair has ranges beyond one.
         """
         count = len(indices)
-        told = np.eye(count) - (held @ np.linalg.pinv(held) if held.size and count else 0.0)
-        apart = told - told.sum(axis=0) / max(count, 1)
+        determined = np.eye(count) - (held @ np.linalg.pinv(held) if held.size and count else 0.0)
+        apart = determined - determined.sum(axis=0) / max(count, 1)
         # Clock skews leave some 1e-5 of a difference that ranges of one pair do not determine.
-        apart = apart if np.linalg.norm(apart) > 1e-3 else told
+        apart = apart if np.linalg.norm(apart) > 1e-3 else determined
         return cls(indices=indices, combinations=apart, independent=max(count - 1, 1), freedom=max(each - 1, 2.0))
 
     @classmethod

@@ -238,11 +238,11 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
     found = errors.slopes
     lasting = lasting_in_pairs(found.by["odds"], number, blocks)
     pairs = len(model.pairs.ends)
-    told = np.bincount(number, found.by["odds"] ** 2, pairs)
+    information = np.bincount(number, found.by["odds"] ** 2, pairs)
     # A wall has one detour: the number of reflections counts for the mean, not the number of ranges.
     reflected = np.bincount(number, found.reflected, pairs)
     odds, odds_var, any_odds, any_odds_var = _shrunk_to_mean(
-        values["odds of pair"], lasting / np.maximum(told, 1e-6), WIDEST_ODDS
+        values["odds of pair"], lasting / np.maximum(information, 1e-6), WIDEST_ODDS
     )
     detour, detour_var, any_detour, any_detour_var = _shrunk_to_mean(
         values["detour of pair"], lasting / np.maximum(reflected, 1e-6), WIDEST_DETOUR
@@ -314,8 +314,8 @@ def mean_variance(information: Floats, slope: Floats, typical: float, bounds: tu
     """
     deviation = np.geomspace(*bounds, 200)
     variance = deviation[:, None] ** 2
-    told = 1 + variance * information
-    likelihood = 0.5 * np.sum(slope**2 * variance / told - np.log(told), axis=1)
+    spread = 1 + variance * information
+    likelihood = 0.5 * np.sum(slope**2 * variance / spread - np.log(spread), axis=1)
     # The steps are equal in the logarithm, so their widths are proportional to the deviation.
     posterior = likelihood - 0.5 * (deviation / typical) ** 2 + np.log(deviation)
     share = np.exp(posterior - posterior.max())

@@ -262,11 +262,11 @@ def split_error(ranges: Ranges, error_m: Floats) -> ErrorSplit:
     """
     pair, count = pairs_of(ranges.initiator, ranges.target).number, int(ranges.session.max(initial=0)) + 1
     codes, group, counts = np.unique(pair * count + ranges.session, return_inverse=True, return_counts=True)
-    told = counts >= 5
-    if not told.any():
+    large = counts >= 5
+    if not large.any():
         return ErrorSplit(within_m=np.nan, between_pairs_m=np.nan, between_sessions_m=np.nan, sessions=0)
-    centre, squares = medians(error_m, group)[told], spreads(error_m, group)[told] ** 2
-    chance, (pairs, sessions) = 1.57 * squares / counts[told], np.divmod(codes[told], count)
+    centre, squares = medians(error_m, group)[large], spreads(error_m, group)[large] ** 2
+    chance, (pairs, sessions) = 1.57 * squares / counts[large], np.divmod(codes[large], count)
     _, number, members = np.unique(pairs, return_inverse=True, return_counts=True)
     centres = np.bincount(number, centre) / members
     freedom = len(pairs) - len(centres)
@@ -275,7 +275,7 @@ def split_error(ranges: Ranges, error_m: Floats) -> ErrorSplit:
     of_centres = (np.nan_to_num(between_sessions) + np.bincount(number, chance) / members) / members
     between_pairs = float(np.var(centres, ddof=1) - np.mean(of_centres)) if len(centres) > 1 else np.nan
     return ErrorSplit(
-        within_m=float(np.sqrt(np.average(squares, weights=counts[told]))),
+        within_m=float(np.sqrt(np.average(squares, weights=counts[large]))),
         between_pairs_m=float(np.sqrt(np.maximum(between_pairs, 0.0))),
         between_sessions_m=float(np.sqrt(between_sessions)),
         sessions=len(np.unique(sessions)),

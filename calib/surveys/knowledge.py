@@ -61,8 +61,8 @@ class Knowledge:
 
     def shape_of(self, arrangement: Arrangement) -> str:
         """Return the known shape of an arrangement: the one stated here, or else its own."""
-        said = "line" if arrangement.name in self.orders else self.shape or arrangement.known
-        return self.shapes.get(arrangement.name, said)
+        default = "line" if arrangement.name in self.orders else self.shape or arrangement.known
+        return self.shapes.get(arrangement.name, default)
 
     def order_of(self, arrangement: Arrangement) -> tuple[int, ...]:
         """Return the order of boards on a line; empty if it is not stated, or if they are not on a line."""

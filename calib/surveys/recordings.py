@@ -290,7 +290,7 @@ def _locations(ranges: Ranges, groups: Pairs) -> tuple[Floats, Floats, Floats]:
     sums = np.bincount(group * PARTS + number, slope, len(count) * PARTS).reshape(-1, PARTS)
     # The ratio of a range's information on its mean to the information with noise alone is the same for all.
     inverse = np.exp(-2 * values["noise"])
-    told = np.bincount(group, inverse) * float(np.sum(slope**2) / np.sum(inverse))
+    information = np.bincount(group, inverse) * float(np.sum(slope**2) / np.sum(inverse))
     lasting = np.where(count >= 4 * PARTS, np.var(sums, axis=1, ddof=1) * PARTS, 0.0)
-    std = np.sqrt(np.maximum(1 / told, lasting / told**2))
+    std = np.sqrt(np.maximum(1 / information, lasting / information**2))
     return median + found.of("mean"), std, np.exp(np.bincount(group, values["noise"]) / count)

@@ -43,19 +43,19 @@ def is_in_order(coordinates: Floats) -> bool:
     return any(float(np.max(np.maximum.accumulate(v) - v)) <= 0.1 for v in ways)
 
 
-def exchanged_boards(said: Sequence[int], coordinates: Floats) -> set[tuple[int, int]]:
-    """Return two boards that must change places so that the boards `said`, at coordinates (n,), are in order; or
+def exchanged_boards(stated: Sequence[int], coordinates: Floats) -> set[tuple[int, int]]:
+    """Return two boards that must change places so that the boards `stated`, at coordinates (n,), are in order; or
     nothing.
 
     Returns more than one pair if the ranges do not distinguish them: 1-2-3-4 with the inner two exchanged is the same
     as with the outer two exchanged, from the other end.
     """
     fitting = set()
-    for i, j in combinations(range(len(said)), 2):
+    for i, j in combinations(range(len(stated)), 2):
         changed = coordinates.copy()
         changed[[i, j]] = coordinates[[j, i]]
         if is_in_order(changed):
-            fitting.add((min(said[i], said[j]), max(said[i], said[j])))
+            fitting.add((min(stated[i], stated[j]), max(stated[i], stated[j])))
     return fitting
 
 

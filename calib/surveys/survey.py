@@ -146,13 +146,13 @@ def wrong_orders(found: Solution) -> Iterator[Finding]:
         pair = max(common, key=common.__getitem__, default=None)
         same = [k for k, some in pairs.items() if pair in some] or list(pairs)[:1]
         both = set.intersection(*(pairs.pop(k) for k in same))
-        said = network.arrangements[same[0]].order
-        seen = [said[n] for n in np.argsort(spots[same[0]]).tolist()]
+        stated = network.arrangements[same[0]].order
+        seen = [stated[n] for n in np.argsort(spots[same[0]]).tolist()]
         where = ", ".join(network.arrangements[k].name for k in same)
         words = ", or ".join(f"{i} and {j}" for i, j in sorted(both))
         what = f"boards {words} are exchanged" if both else "boards stand in another order than stated"
         text = (
-            f"{where}: {what}: the stated order is {'-'.join(map(str, said))}, but by the ranges of "
+            f"{where}: {what}: the stated order is {'-'.join(map(str, stated))}, but by the ranges of "
             f"{network.arrangements[same[0]].name} it is {'-'.join(map(str, seen))}"
         )
         yield Finding("exchanged labels", text, "check their labels", BUDGET)

@@ -321,9 +321,9 @@ class ReportCheck:
             self._last[pair] = board, report
             return None
         both = ((n, getattr(before[1], n), getattr(report, n)) for n in RangeReport.FIELDS if n != "neighbour")
-        told = ", ".join(f"{name} {one} and {other}" for name, one, other in both if one != other)
+        differences = ", ".join(f"{name} {one} and {other}" for name, one, other in both if one != other)
         whose = f"boards {before[0]} and {board} report one exchange of {pair[0]} with {pair[1]} differently"
-        return f"{whose}: {told}" if told else None
+        return f"{whose}: {differences}" if differences else None
 
 
 CorrectionSource = str | os.PathLike[str] | Correction | Callable[[Exchanges], Columns]

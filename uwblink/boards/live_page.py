@@ -92,8 +92,8 @@ class LivePage(Closing, Listener):
         """Return the part that changes: name, counts, pairs, faults, disk. The next recorder may have the same port."""
         progress = self._progress
         faults = reversed([*progress.last_faults])
-        told = (f"{_clock(one.time_ns)} board {one.board}: {one.kind}: {one.detail}" for one in faults)
-        items = "".join(f"<li>{escape(text)}</li>" for text in told)
+        lines = (f"{_clock(one.time_ns)} board {one.board}: {one.kind}: {one.detail}" for one in faults)
+        items = "".join(f"<li>{escape(text)}</li>" for text in lines)
         listed = f"<ul>{items}</ul>" if items else ""
         since = f" since {_clock(progress.start_ns)}" if progress.start_ns else ""
         head = f"<h1>recording {escape(self._path.name)}{since}</h1><p>{escape(str(progress))}</p>"

@@ -324,12 +324,12 @@ def _without_repeats(rows: StagedRows) -> tuple[StagedRows, str]:
     ).fetchall()
     if count < MIN_ROWS or after >= others / 2:
         return rows, ""
-    said = f"of {rows.count()} ranges repeat the one before of the same two devices, {after:.3g} ms after it"
+    text = f"of {rows.count()} ranges repeat the one before of the same two devices, {after:.3g} ms after it"
     if 2 * turned < count:
-        return rows, f"{count} {said}, others follow after {others:.3g} ms: some may be logged twice; all are kept"
+        return rows, f"{count} {text}, others follow after {others:.3g} ms: some may be logged twice; all are kept"
     rows.db.execute(
         f"CREATE TABLE repeats AS SELECT row FROM ({gaps}) WHERE equal AND turned AND gap_ms < {others / 2!r}"
     )
     (merged,) = StagedRows(rows.db, "repeats", ()).values("count(*)")
     kept = rows.where("rowid NOT IN (SELECT row FROM repeats)")
-    return kept, f"{merged} {said}, as logged by the other device, and are left out"
+    return kept, f"{merged} {text}, as logged by the other device, and are left out"

@@ -471,13 +471,13 @@ def _motive(path: Path, head: Lines) -> PoseLayout:
     Euler angles are about the rotated axes (NaturalPoint's knowledge base, "Changes in Motive's reported Euler
     angles"), in degrees, in the order that the header names.
     """
-    said = dict(zip(head[0][::2], head[0][1::2], strict=False))
+    header = dict(zip(head[0][::2], head[0][1::2], strict=False))
     units = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
-    unit, rotation = units.get(said.get("Length Units", "Meters").lower()), said.get("Rotation Type", "Quaternion")
+    unit, rotation = units.get(header.get("Length Units", "Meters").lower()), header.get("Rotation Type", "Quaternion")
     euler = rotation if sorted(rotation) == ["X", "Y", "Z"] else ""
     if unit is None or not (euler or rotation == "Quaternion"):
         raise ImportTableError(
-            f"{path}: found {rotation} and {said.get('Length Units')}, export quaternions and metres"
+            f"{path}: found {rotation} and {header.get('Length Units')}, export quaternions and metres"
         )
     types, kinds = _header(path, head, "Rigid Body"), _header(path, head, "Rotation", "Position")
     bodies: dict[str, dict[str, int]] = {}
@@ -515,15 +515,18 @@ def _vicon(path: Path, head: Lines) -> PoseLayout:
 
 def _qualisys(path: Path, head: Lines) -> PoseLayout:
     """Return the layout of Qualisys' 6D TSV: lines of words and values, then a line of columns by body."""
-    said = {cells[0]: cells[1:] for cells in head if len(cells) > 1}
-    names, first = [name.strip() for name in said.get("BODY_NAMES", ()) if name.strip()], _header(path, head, "Rot[0]")
+    header = {cells[0]: cells[1:] for cells in head if len(cells) > 1}
+    names, first = (
+        [name.strip() for name in header.get("BODY_NAMES", ()) if name.strip()],
+        _header(path, head, "Rot[0]"),
+    )
     starts = [k for k, cell in enumerate(head[first]) if cell.strip().endswith("Rot[0]")]
     if len(starts) != len(names):
         raise ImportTableError(f"{path}: has {len(names)} BODY_NAMES and {len(starts)} bodies below: export 6D data")
     # Position, three angles and the residual come before the matrix.
     fields = ("x", "y", "z", *(f"r{k}" for k in range(9)))
     places = [dict(zip(fields, (k - 7, k - 6, k - 5, *range(k, k + 9)), strict=True)) for k in starts]
-    timed, rate = head[first][1:2] == ["Time"], number_in(next(iter(said.get("FREQUENCY", ())), "")) or math.nan
+    timed, rate = head[first][1:2] == ["Time"], number_in(next(iter(header.get("FREQUENCY", ())), "")) or math.nan
     layout = PoseLayout(
         form="Qualisys", names=head[first], time=int(timed), ns=1e9 if timed else 1e9 / rate, bodies={},
         header=first + 1, metres=DISTANCE_UNITS["mm"],

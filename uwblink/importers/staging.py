@@ -183,13 +183,13 @@ class Staging:
             words = [cell for cell in cells if cell[2]]
             count, total = sum(n for _, n, _ in words), sum(n for _, n, _ in cells)
             what = "plain degrees Celsius (-65 to 150)" if name in TEMPERATURES else "numbers"
-            said = f"{count} of {total} cells of column {header[:60]!r} are no {what}"
+            note = f"{count} of {total} cells of column {header[:60]!r} are no {what}"
             if words and 2 * count >= total:
                 first = json.dumps(words[0][0][:40])
                 remedy = f"name another column for {name} in the map, or state missing = [{first}]"
-                raise ImportTableError(f"{self.paths[0]}: {said}, such as {first}; {remedy}")
+                raise ImportTableError(f"{self.paths[0]}: {note}, such as {first}; {remedy}")
             if words:
-                yield f"{said}, such as {words[0][0][:40]!r}, and are taken as missing"
+                yield f"{note}, such as {words[0][0][:40]!r}, and are taken as missing"
 
     def require(self, rows: StagedRows, names: Iterable[str]) -> None:
         """Raise the error for the first missing column."""
