@@ -80,7 +80,7 @@ class RecordingView:
 
     @property
     def error_m(self) -> Floats:
-        """Range less truth, shape (n,)."""
+        """Range minus truth, shape (n,)."""
         return self.ranges.raw_m - self.ranges.truth_m
 
     def chosen(self, rows: Bools | Ints) -> RecordingView:
@@ -88,7 +88,7 @@ class RecordingView:
         return replace(self, exchanges=self.exchanges[rows], ranges=self.ranges[rows])
 
     def less_pairs(self, error_m: Floats) -> Floats:
-        """Return errors (n,) less the median of their pair, NaN for pairs with ten or fewer."""
+        """Return errors (n,) minus the median of their pair, NaN for pairs with ten or fewer."""
         good = np.isfinite(error_m)
         pair = pairs_of(self.ranges.initiator[good], self.ranges.target[good]).number
         left = np.full(len(error_m), np.nan)
@@ -163,8 +163,8 @@ def examined_part(count: int) -> str:
 class QuickFit:
     """A robust fit to the ranges (n,) of all pairs with enough of them, by session and time.
 
-    `rows` (n,) are those of each recording, `error` (n,) is measured less true, metres. `start` is the robust fit of a
-    sample, with the scale of the loss, and `x` (p,) are the unknowns of all.
+    `rows` (n,) are the rows of the recordings, `error` (n,) is measured minus true, metres. `start` is the robust fit
+    of a sample, with the scale of the loss, and `x` (p,) are the unknowns of all.
     """
 
     rows: Ints
@@ -203,7 +203,7 @@ class QuickFit:
 
     @cached_property
     def residual(self) -> Floats:
-        """Measured less fitted (n,), metres."""
+        """Measured minus fitted (n,), metres."""
         return self.ranges.residuals(self.x)
 
     @cached_property

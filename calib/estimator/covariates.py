@@ -50,7 +50,7 @@ judgement: in a hall where it was 0.09 and less, coefficients of 6 cm made anoth
 
 @dataclass(frozen=True, kw_only=True)
 class Covariate:
-    """Values of a covariate less their `centre` (k,) at both ends of ranges, `lower` first (the smaller id), (n, k).
+    """Values of a covariate minus their `centre` (k,) at both ends of ranges, `lower` first (the smaller id), (n, k).
 
     Unknown values are 0, and so are directions at tags whose bodies do not turn; `tags` are the tags with other values,
     `bodies` the bodies of tags; `square` (k, k) is the mean product of two values of these tags, and `span` (2, k) are

@@ -22,8 +22,8 @@ HELD = 1e-13
 priors determine, and is some hundred times the rounding error."""
 
 PROBES = 24
-"""Random vectors by which traces of large products are estimated (Hutchinson 1990). The relative error is the root of
-2 over their number times that of unknowns: 3 % for a hundred unknowns."""
+"""Random vectors by which traces of large products are estimated (Hutchinson 1990). The relative error is the root of 2
+over their number times the number of unknowns: 3 % for a hundred unknowns."""
 
 Matrix = Floats | sparse.csc_matrix
 

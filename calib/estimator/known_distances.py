@@ -51,8 +51,8 @@ ROBUST_LOSS = "cauchy"
 SCALE_OF_SPREAD = 0.5
 """Scale of a robust loss over the robust spread of the residuals.
 
-Half the spread keeps the optimum with the core when a tenth of the data has a positive tail, and still leaves a Cauchy
-loss two thirds of least squares' efficiency on clean data.
+With half the spread the optimum stays at the core if a tenth of the data has a positive tail, and a Cauchy loss has two
+thirds of the efficiency of least squares on clean data.
 """
 
 LEAST_SCALE_M, LARGEST_SPREAD_M = 0.0005, 3.0
@@ -80,7 +80,7 @@ class Fitted:
     beside: tuple[Rows, ...] = ()
 
     def slopes(self, blocks: TimeBlocks) -> list[Slopes]:
-        """Return the slopes of ranges and of differences of arrival, each with those of both by block of time."""
+        """Return the slopes of ranges and of differences of arrival, each with the sums of both by block of time."""
         kinds = [(self.rows, blocks)]
         if self.heard is not None and self.arrivals is not None:
             kinds.append((self.heard, replace(blocks, number=blocks.number[self.arrivals.exchange])))
@@ -93,13 +93,13 @@ class Fitted:
 
 @dataclass(frozen=True, kw_only=True)
 class KnownDistances:
-    """A fit to known distances: its `model`, the search that ended it, and the covariances of what was fitted.
+    """A fit to known distances: its `model`, the search that ended it, and the covariances of the fitted values.
 
-    `values` are unknowns by kind, `covariances` those of "delay", of all curves side by side ("curve"), of the noise
-    ("noise"), of patterns over direction ("pattern") and of delays and slopes over temperature ("temperature").
-    `residuals` (n,) are fitted less true ranges in the order of the model's ranges, metres. `searches` are the one
-    search, or that of the delays and that of the curves. `persistence` is that of errors of delays, and `slopes` and
-    `slopes_of_heard` are those of the first search.
+    `values` are unknowns by kind, `covariances` the covariances of "delay", of all curves together ("curve"), of the
+    noise ("noise"), of patterns over direction ("pattern") and of delays and slopes over temperature ("temperature").
+    `residuals` (n,) are fitted minus true ranges in the order of the model's ranges, metres. `searches` are the only
+    search, or the searches for delays and for curves. `persistence` is the persistence of errors of delays; `slopes`
+    and `slopes_of_heard` are from the first search.
     """
 
     model: RangeModel
@@ -119,12 +119,12 @@ class KnownDistances:
 
     @property
     def success(self) -> bool:
-        """Return whether every search settled."""
+        """Return whether every search converged."""
         return all(search.optimum.success for search in self.searches)
 
     @property
     def steps(self) -> int:
-        """Return how many steps all searches took."""
+        """Return the number of steps of all searches."""
         return sum(search.steps for search in self.searches)
 
 
@@ -288,8 +288,8 @@ def fit_likelihood(model: RangeModel, error: Floats, pilot: Fitted, heard: Arriv
 def _maximize_by_samples(
     rows: Sequence[RangeRows], gauge: Sequence[NormalRows], layout: Layout, x: Floats, asked: Ints | None = None
 ) -> tuple[Optimum, int]:
-    """Return the optimum of rows, the first those of ranges, found on samples of growing size and then on all of them,
-    and the steps taken."""
+    """Return the optimum of rows (ranges first), found on samples of growing size and then on all of them, and the
+    number of steps."""
     count, priors, size, steps = len(rows[0]), Priors(layout), FIRST_SAMPLE, 0
     order = np.random.default_rng(0).permutation(count)
     while 2 * size < count:
@@ -359,7 +359,7 @@ def _fit_in_sequence(
 ) -> KnownDistances:
     """Fit delays first, then the curves to the residuals, as in ICRA 2023, sections III and IV, with splines.
 
-    The curves keep their constants and the delays are those of the first step, unless a reference power is given.
+    The curves keep their constants and the delays are from the first step, unless a reference power is given.
     """
     free = replace(model, carriers=(None,) * len(model.carriers))
     first = with_covariances(free, robust_fit(free, error, loss, scale_m, ("delay",)), blocks)
@@ -382,8 +382,8 @@ def _fit_in_sequence(
 class DescribedErrors:
     """The error model of a fit: unknowns by kind, the covariance of the noise's unknowns, and the slopes of each range.
 
-    `slopes` are those of every range (n,) by the residual and the odds, in the order of the model's ranges, for errors
-    less `location_m`.
+    `slopes` are the slopes of every range (n,) by the residual and the odds, in the order of the model's ranges, for
+    errors minus `location_m`.
     """
 
     values: dict[str, Floats]

@@ -261,8 +261,8 @@ class RangeModel:
         parts: Sequence[Part] = (),
         only: Sequence[str] | None = None,
     ) -> tuple[Layout, RangeRows]:
-        """Return the layout of the model's unknowns, or those of some kinds, and of others after them, and the rows of
-        ranges with residuals (n,)."""
+        """Return the layout of the model's unknowns, or of some kinds, followed by others, and the rows of ranges with
+        residuals (n,)."""
         unknowns = [u for u in self.unknowns if only is None or u.kind in only]
         kinds = {u.kind for u in unknowns}
         layout = Layout((*unknowns, *more))

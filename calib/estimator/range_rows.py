@@ -68,7 +68,7 @@ class Errors(Protocol):
 
     @property
     def dispersion(self) -> float:
-        """Return the ratio of the variance of sums of slopes to that of independent draws of the density."""
+        """Return the ratio of the variance of sums of slopes to the variance for independent draws of the density."""
         ...
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:

@@ -48,7 +48,7 @@ class TimeBlocks:
         return sparse.csr_matrix((np.ones(len(rows)), place), shape=(self.count, len(rows)))
 
     def pieces(self, series: Floats, spans: int = 1) -> Floats:
-        """Return sums by block (blocks, k) as columns of pieces of equal length, less their means.
+        """Return sums by block (blocks, k) as columns of pieces of equal length, minus their means.
 
         There are about as many pieces as `spans`; no piece crosses sessions. A single piece is the unchanged series.
         """

@@ -323,7 +323,7 @@ def mean_variance(information: Floats, slope: Floats, typical: float, bounds: tu
 
 
 def _at_nodes(model: RangeModel, values: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
-    """Return lifted powers (NODES,), the noise there in metres, and the log odds there less their level."""
+    """Return lifted powers (NODES,), the noise there in metres, and the log odds there minus their level."""
     level = float(values["noise level"][0])
     if model.noise is None:
         return np.array([0.999, 1.001]) * np.median(model.lifted), np.full(2, np.exp(level)), np.zeros(2)
@@ -337,7 +337,8 @@ def _at_nodes(model: RangeModel, values: dict[str, Floats]) -> tuple[Floats, Flo
 
 
 def _shrunk_to_mean(value: Floats, variance: Floats, widest: float) -> tuple[Floats, Floats, float, float]:
-    """Shrink values (pairs,) with known variances to their mean; return them, their variances, and those of a new pair.
+    """Shrink values (pairs,) with known variances to their mean; return them, their variances, and value and variance
+    of a new pair.
 
     The variance between pairs is the maximum of a normal likelihood (by expectation-maximisation). Returned variances
     are `widest` at most.

@@ -157,7 +157,7 @@ class Priors:
         return found
 
     def value(self, x: Floats) -> float:
-        """Return the log density of the priors at unknowns (p,), less its constant."""
+        """Return the log density of the priors at unknowns (p,), minus its constant."""
         return -0.5 * sum(weight * float(away @ pulled) for weight, _, away, pulled in self._distances(x))
 
     def pull(self, x: Floats) -> Floats:

@@ -88,7 +88,7 @@ class PlantedComparison:
 
     Shifts along undetermined splits of the calibration are removed from the delays as well.
 
-    `delay_error_ns` maps tags to fitted less planted delays, `curve_rms_m` is the rms of the bias curves' difference
+    `delay_error_ns` maps tags to fitted minus planted delays, `curve_rms_m` is the rms of the bias curves' difference
     over the ranges inside the fitted power, `correction_rms_m` the rms difference of the whole correction of each
     range; NaN if no curve was planted.
     """

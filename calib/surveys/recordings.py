@@ -281,7 +281,7 @@ def _locations(ranges: Ranges, groups: Pairs) -> tuple[Floats, Floats, Floats]:
     )
     part = Part(parameter=RESIDUAL, kind="mean", columns=group[:, None], values=np.full((len(group), 1), -1.0))
     layout, rows = model.build(residual, errors, (mean, *unknowns), (part, *parts), only=())
-    # The likelihood has several maxima: with a moved board, that of shorter steps was less by 140.
+    # The likelihood has several maxima: with a moved board, shorter steps ended at one that was lower by 140.
     searches = (maximize([rows], Priors(layout), layout.start(), longer=longer) for longer in (LONGER, 2 * LONGER))
     found = max(searches, key=lambda one: one.value)
     values = rows.values(found.x)

@@ -266,7 +266,7 @@ class TapeRows:
     std_m: Floats
 
     def left(self, x: Floats) -> Floats:
-        """Return taped less estimated distances (n,)."""
+        """Return taped minus estimated distances (n,)."""
         return self.measured_m - self.geometry.distances(x)[0]
 
     def terms(self, x: Floats) -> Iterator[Terms]:
