@@ -160,7 +160,7 @@ def main() -> None:
         cases = [[one] for one in recipes] if planted else [recipes]
         lines.append(_line(row(name, [[flown(*world) for world in product(case, seeds)] for case in cases])))
     walks = [[sessions(rate_m2, seed) for seed in seeds] for rate_m2 in RATES_M2]
-    lines.append(_line(row("from day to day: none, 3, 10 mm a root of a day", walks)))
+    lines.append(_line(row("from day to day: none, 3, 10 mm/√day", walks)))
     drifts, offsets = [{"drift_m": one} for one in DRIFTS_M], [{"offset_m": one} for one in OFFSETS_M]
     lines.append(_line(filtered("in a filter: no drift, one tag, two tags", "online", drifts, seeds[:8])))
     lines.append(_line(filtered("constants of pairs of 0, 2, 5 cm", "robust", offsets, seeds[:8])))

@@ -457,7 +457,7 @@ FAULTS: Final = (
          partial(simulated, settings=("radio.multipath.share=0.5",)), names("reflections")),
     Case("an anchor 20 to 60 cm elsewhere", ANCHORS, partial(moved_anchor, plan=ANCHORS, both=False),
          names("anchor stands elsewhere")),
-    Case("six that range with each other, all 10 cm off", replace(RIG, among_anchors=True), all_anchors_off,
+    Case("six anchors that range with each other, all 10 cm off", replace(RIG, among_anchors=True), all_anchors_off,
          names("anchor stands elsewhere", "places that do not close")),
     Case("an anchor moved between two recordings", ANCHORS, partial(moved_anchor, plan=ANCHORS, both=True),
          names("anchor moved between recordings")),
@@ -525,8 +525,8 @@ def lines_of(found: list[tuple[int, int, Counter[str]]]) -> str:
         named.setdefault(" or ".join(sorted(case.expected)), []).append(case.name)
     return "\n".join([
         f"Sound recordings: {alarms} of {runs} with a false alarm ({100 * alarms / runs:.1f} %). Planted faults: "
-        f"{hits} of {planted} found ({100 * hits / planted:.0f} %), {beside} with a false finding besides. "
-        f"Not as they should: {'; '.join(told) or 'none'}.",
+        f"{hits} of {planted} found ({100 * hits / planted:.0f} %), {beside} with an additional false finding. "
+        f"Not as expected: {'; '.join(told) or 'none'}.",
         "", "| finding | planted |", "|---|---|",
         *(f"| {fault} | {'; '.join(names)} |" for fault, names in named.items()),
     ])  # fmt: skip

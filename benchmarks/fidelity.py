@@ -30,7 +30,7 @@ ICRA = ROOT / "scenarios" / "icra2023"
 BENCH = ROOT / "scenarios" / "two_boards_on_a_bench" / "bench.toml"
 
 BEGIN, END = "<!-- fidelity -->", "<!-- end of fidelity -->"
-HEAD = """`make fidelity`. Measured: 1833 exchanges of real boards (MILUV); raw and residual errors of Shalaby et al., ICRA 2023, sections V and VI; 17 118 samples published with the paper; 317 exchanges of one MILUV flight among obstacles. Simulated: the flights of `scenarios/icra2023`. A figure is *tuned* if a setting was chosen to hit it, *predicted* if it follows from other settings.
+HEAD = """`make fidelity`. Measured: 1833 exchanges of real boards (MILUV); raw and residual errors of Shalaby et al., ICRA 2023, sections V and VI; 17 118 samples published with the paper; 317 exchanges of one MILUV flight among obstacles. Simulated: the flights of `scenarios/icra2023`. A figure is *tuned* if a setting was chosen to match it, *predicted* if it follows from other settings.
 
 | what | measured | simulated | how |
 |---|---|---|---|
@@ -58,7 +58,7 @@ def main() -> None:
 
 
 TWIN = """
-**A recorded flight and its twin.** `uwbsim twin` fitted a scenario to the MILUV flight, so this shows what the simulator can express and predicts nothing. Largest difference of shares: """
+**A recorded flight and its twin.** `uwbsim twin` fitted a scenario to the MILUV flight, so this shows what the simulator can represent, not predict. Largest difference of shares: """
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:

@@ -110,10 +110,10 @@ TITLES: Final = (
     "flight",
     "seeds",
     "determined: planned, fitted",
-    "apart, ps: promised (of itself, of robots in a room)",
-    "came out, rms",
+    "apart, ps: promised (by this flight, by robots in a room)",
+    "actual, rms",
     "common, ps: promised",
-    "came out, rms",
+    "actual, rms",
 )
 HEAD: Final = f"| {' | '.join(TITLES)} |\n{'|---' * len(TITLES)}|"
 

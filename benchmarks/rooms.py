@@ -1,8 +1,9 @@
 """How far delays are to be trusted where errors depend on places: the table of rooms in docs/accuracy.md.
 
 Scenarios whose errors all come from one room's geometry, others that have nothing of it, and fields of errors of
-`tests.calib.estimation.fields`, which share nothing with the simulator. Seeds are those from `FIRST_REPORTED` on, which
-have chosen nothing. Errors of delays are those about their mean: a scenario's planted curve is not zero where ours is.
+`tests.calib.estimation.fields`, which share no code with the simulator. Seeds are those from `FIRST_REPORTED` on, which
+were not used for tuning. Errors of delays are those about their mean, because a scenario's planted curve and the fitted
+one are zero at different powers.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ SCENARIOS: Final = {
     "icra2023 test 1": ("icra2023/test1.toml", 40.0),
 }
 FIELDS: Final[dict[str, dict[str, Any]]] = {
-    "nothing of the kind, three bodies": {"bodies": 3},
-    "nothing of the kind, four bodies": {"bodies": 4},
-    "nothing of the kind, five bodies": {"bodies": 5},
+    "no such errors, three bodies": {"bodies": 3},
+    "no such errors, four bodies": {"bodies": 4},
+    "no such errors, five bodies": {"bodies": 5},
     "a field of 2 cm over 2 m, three bodies": {"bodies": 3, "field_m": 0.02},
     "a field of 2 cm over 2 m, four bodies": {"bodies": 4, "field_m": 0.02},
     "a field of 2 cm over 4 m, four bodies": {"bodies": 4, "field_m": 0.02, "wave_m": 4.0},

@@ -42,12 +42,12 @@ EVERY: Final = 50
 HEAD: Final = """\
 # Real data
 
-Public flights, calibrated and judged by the commands below (`make scoreboard DATA=folder`), never on ranges that a calibration of ours was fitted to. Errors are ranges minus true distances; "in 95 %" are ranges within their stated 95 % interval. Localization is the position RMSE of `calib localize`: by the robust filter, of authors' calibrations with each range's variance, of raw ranges with a fixed one.
+Public flights, calibrated and evaluated by the commands below (`make scoreboard DATA=folder`). Our calibrations are evaluated on ranges that were not fitted. Errors are ranges minus true distances; "in 95 %" are ranges within their stated 95 % interval. Localization is the position RMSE of `calib localize`: robust filter; for authors' calibrations a filter with each range's variance, for raw ranges with a fixed one.
 
 | ranges | calibration | count | median (cm) | robust deviation (cm) | in 95 % (%) | localization (m) |
 |---|---|---|---|---|---|---|
 """
-DOUBTED: Final = "\n## What was refused or doubted\n\nFindings, warnings and errors, each once, and its first clause.\n"
+DOUBTED: Final = "\n## What was refused or doubted\n\nFindings, warnings and errors: the first clause of each, once.\n"
 RECIPES: Final = "\n## Recipes\n\nA and B are flights; every command is also run with A and B exchanged.\n"
 
 
@@ -244,7 +244,7 @@ DATA_SETS: Final = (
         "STAR-loc",
         "utiasASRL/starloc at d1367dc, `data/loop-2d-fast_s1|s2/uwb.csv` and `mocap/uwb_markers_v1.csv`: two tags on a "
         "rig, eight anchors. A-few.csv is every 50th row of A.csv, A-rig.csv its poses of the rig, rig.toml has lever "
-        "arms and anchors: markers are not numbered as radios, so each radio takes the marker that fits `gt_range`. "
+        "arms and anchors: numbers of markers and radios differ; each radio gets the marker that fits `gt_range`. "
         "Authors': `range_calib` and `std`.",
         "starloc_loop-2d-fast.tar.xz",
         prepare_starloc,
@@ -296,7 +296,7 @@ calib localize B.uwb -c A.json
     DataSet(
         "samples of the paper",
         "decargroup/uwb_calibration: `lifted_fpp` and `bias_m` behind the paper's curve, delays corrected; no time, no "
-        "pair. half1.csv and half2.csv hold every second sample as a range of 10 m, so that nothing changes between them. Authors': splines of "
+        "pair. half1.csv and half2.csv contain every second sample as a range of 10 m, so only errors differ. Authors': splines of "
         "`calib_results_new.pickle` at 3e09741.",
         "icra2023_bias_fpp.csv",
         prepare_paper,
@@ -324,8 +324,8 @@ calib fit A.uwb -o A.json --hold-out 0.3
     ),
     DataSet(
         "swarm broadcasts",
-        "prathje/uwb-swarm-ranging at 0d023d2, `scripts/out`: boards that broadcast and stand where nobody says. grid.toml "
-        "has places that are made up: a fit of delays is refused. They cancel where each pair has a constant.",
+        "prathje/uwb-swarm-ranging at 0d023d2, `scripts/out`: boards that broadcast, at unknown places. grid.toml has "
+        "invented places: a fit of delays is refused. They cancel if each pair has a constant.",
         "swarm_broadcast_logs.tar.xz",
         prepare_swarm,
         """\

@@ -24,7 +24,7 @@ from benchmarks import doctor
 from benchmarks.flights import Plan, fly
 
 FIRST_SEED: Final = 101_000
-"""Seeds from here on have chosen nothing, here or in `benchmarks.doctor`."""
+"""Seeds from here on were not used for tuning, here or in `benchmarks.doctor`."""
 
 MINUTE: Final = Plan(seconds=60)
 

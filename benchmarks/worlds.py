@@ -23,7 +23,7 @@ from calib.data.ranges import Ranges
 Floats = NDArray[np.float64]
 
 FIRST_REPORTED: Final = 10_000
-"""Seeds from here on have chosen nothing."""
+"""Seeds from here on were not used for tuning."""
 
 LIGHT_M_PER_NS: Final = 0.299702547
 

@@ -1,6 +1,6 @@
 """How well fits do in worlds that share nothing with the simulator: the second table of docs/accuracy.md.
 
-Seeds are those from `FIRST_REPORTED` on, which have chosen nothing.
+Seeds are those from `FIRST_REPORTED` on, which were not used for tuning.
 """
 
 from __future__ import annotations
@@ -179,13 +179,13 @@ SAMPLES_TEXT = """
 {rows}
 """
 
-TEXT = """`make worlds`, {date}: {seeds} seeds of [these worlds](../benchmarks/worlds.py), which share nothing with simulator and fit; 38 400 ranges of five tags in 240 s unless stated. "Persistent 1 s, 2 cm over 3 s": reflections that last 1 s on average and an error of 2 cm with a memory of 3 s. "Another flight" has the same boards.
+TEXT = """`make worlds`, {date}: {seeds} seeds of [these worlds](../benchmarks/worlds.py), which share no code with simulator and fit; 38 400 ranges of five tags in 240 s unless stated. "Persistent 1 s, 2 cm over 3 s": reflections that last 1 s on average and an error of 2 cm with a memory of 3 s. "Another flight" has the same boards.
 
 {table}
 
 **False alarms**: {alarms} of {doubted} fits of sound worlds gave a warning, {explained} of them that power and distance are confounded.
 
-**Planted faults** (wrong units, offsets and drifts of tags and pairs, wrong signs and roles), {plantings} seeds each. "Right" is within three printed standard errors without a warning.
+**Planted faults** (wrong units, offsets and drifts of tags and pairs, wrong signs and roles), {plantings} seeds each. "Right": delays within three printed standard errors, no warning.
 
 {rows}
 {samples}"""

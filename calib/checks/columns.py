@@ -29,7 +29,7 @@ PLAUSIBLE_M: Final = 1000.0
 """Longer than any range of a UWB radio."""
 
 UNITS_A_METRE: Final = {"mm": 1000.0, "cm": 100.0, "in": 1 / 0.0254, "ft": 1 / 0.3048}
-"""Units of length by the names that a map takes: how many are a metre."""
+"""Units of length by their names in a map: the number of units in a metre."""
 
 POWER_FACTORS: Final = {
     "256 steps a dBm": 1 / 256,
@@ -38,10 +38,11 @@ POWER_FACTORS: Final = {
     "hundredths of a dBm": 0.01,
     "the other sign": -1.0,
 }
-"""Factors that make dBm of powers: firmwares print a loss, or integers. The last that fits is the simplest."""
+"""Factors that convert powers to dBm: firmwares print a loss, or integers. The last factor that fits is the
+simplest."""
 
 MIN_VALUES_OF_UNIT: Final = 20
-"""Fewer ranges, or powers, say nothing of a unit: the median of so many is known to 0.28 of their spread
+"""Minimum number of ranges or powers to determine a unit: the median of 20 is known to 0.28 of their spread
 (`calib.spread.STD_OF_MEDIAN` over the root of their number), and units differ by a factor of two or more."""
 
 
@@ -121,7 +122,7 @@ def doubled(view: RecordingView) -> Iterator[Candidate]:
 
 
 def corrupted(view: RecordingView) -> Iterator[Candidate]:
-    """Find exchanges that are impossible or contradict themselves; the other checks leave them out."""
+    """Find exchanges that are impossible or contradict themselves; the other checks omit these."""
     bad = impossible(view)
     count = int(np.count_nonzero(bad))
     yield Candidate(
@@ -133,18 +134,20 @@ def corrupted(view: RecordingView) -> Iterator[Candidate]:
 
 
 def mixed(view: RecordingView) -> Iterator[Candidate]:
-    """Find recordings that were merged by host time: initiators' stamps jump to another time and back, row by row."""
+    """Find recordings that were merged by host time: initiators' stamps jump to another time and back from
+    row to row.
+    """
     e, half_s = view.exchanges, 2.0 ** (view.exchanges.bits - 1) / TICKS_PER_SECOND
     each = [e[e.initiator == tag] for tag in np.unique(e.initiator[e.tx1 != 0])]
     away_s = [
         (np.diff(own.tx1) / TICKS_PER_SECOND - np.diff(own.time_ns) * 1e-9 + half_s) % (2 * half_s) - half_s
         for own in each
     ]
-    # USB is late by less than half a second, which 32 bits do not count to.
+    # USB is late by less than half a second, longer than a counter of 32 bits.
     returns = [one[1:][(np.abs(one[1:]) > 0.5) & (np.abs(one[1:] + one[:-1]) < 0.05)] for one in away_s]
     jumps_s = np.abs(np.concatenate([*returns, np.zeros(0)]))
     if len(jumps_s):
-        # Damaged stamps jump by any time, those of another recording by the same.
+        # Damaged stamps jump by random times, stamps of another recording by a constant time.
         same = int(np.count_nonzero(np.abs(jumps_s - np.median(jumps_s)) < 0.1))
         yield Candidate(
             "recordings mixed by their times",
@@ -161,7 +164,8 @@ def rare_poses(view: RecordingView) -> Iterator[Candidate]:
         for body in names_in(view.poses.body)
         if np.ptp((one := view.poses[view.poses.body == body]).time_ns) > 5e7 * len(one) > 5e7 * 2
     }
-    # Over half of the time a steady acceleration moves a body by a quarter; noise of frequent poses is no motion.
+    # In half of the time a constant acceleration moves a body by a quarter of the distance; noise of frequent poses is
+    # not motion.
     off_m = {
         body: np.median(np.linalg.norm(at[1:-1] - (at[2:] + at[:-2]) / 2, axis=1)) / 4 for body, at in rare.items()
     }
@@ -195,11 +199,11 @@ def reported(view: RecordingView) -> Iterator[Candidate]:
     ratios = _reported_over_stamps(view)
     ratio = float(np.median(ratios)) if len(ratios) >= MIN_VALUES_OF_UNIT else 1.0
     evidence = f"reported ranges are {ratio:.5g} times those from the stamps"
-    # This number of ratios is needed to distinguish the speeds of light in air and in vacuum.
+    # Number of ratios that are needed to distinguish the speeds of light in air and in vacuum.
     if len(ratios) >= 100 and abs(ratio * SPEED_OF_LIGHT / 299_792_458.0 - 1) < 5e-5:
         yield Candidate("speed of light in vacuum", f"{evidence}: 299 792 458 m/s instead of 299 702 547")
     for unit, many in UNITS_A_METRE.items():
-        # Delays of boards may change a range of some metres by so much.
+        # Delays of boards may change a range of some metres by this amount.
         if abs(ratio / many - 1) < 0.05:
             yield Candidate("unit of the reported ranges", evidence, words={"unit": unit})
 
@@ -210,32 +214,32 @@ def another(view: RecordingView) -> Iterator[Candidate]:
     """
     e = view.exchanges[:: max(len(view.exchanges) // 4000, 1)]
     names, counts = np.unique(e.protocol, return_counts=True)
-    said = str(names[int(np.argmax(counts))])
+    given = str(names[int(np.argmax(counts))])
     third = bool(np.mean((e.tx3 | e.rx3) != 0) > 0.5)
     highest = max(int(stamps.max(initial=0)) for stamps in (e.tx1, e.rx1, e.tx2, e.rx2))
     tried = {
         (name, bits): _possible_share(replace(e, protocol=np.full(len(e), name), bits=bits))
         for name, row in PROTOCOLS.items()
         for bits in (32, 40)
-        if highest < 1 << bits and (name, bits) != (said, e.bits) and (row.third_sender is not None) == third
+        if highest < 1 << bits and (name, bits) != (given, e.bits) and (row.third_sender is not None) == third
     }
     if not tried:
         return
-    name, bits = max(tried, key=lambda key: (round(tried[key], 2), key[1] == e.bits, key[0] == said))
+    name, bits = max(tried, key=lambda key: (round(tried[key], 2), key[1] == e.bits, key[0] == given))
     share, own = tried[name, bits], _possible_share(e)
     # A wrong width spoils only exchanges during which the counter wraps; a wrong protocol spoils most.
-    if share < max(0.5, own + (0.01 if name == said else 0.2)):
+    if share < max(0.5, own + (0.01 if name == given else 0.2)):
         return
     numbers = f"{100 * share:.1f} % of the ranges are possible, {100 * own:.1f} % with the settings of the recording"
-    if name == said:
+    if name == given:
         yield Candidate("timestamp width", f"as {bits}-bit stamps {numbers}", words={"bits": bits})
     else:
-        alike = [n for n in PROTOCOLS if tried.get((n, bits), 0.0) > share - 0.01 and n not in (said, name)]
+        alike = [n for n in PROTOCOLS if tried.get((n, bits), 0.0) > share - 0.01 and n not in (given, name)]
         also = f" (or {' or '.join(alike)})" if alike else ""
         width, setting = (f" with {bits} bits", f", bits = {bits}") if bits != e.bits else ("", "")
         yield Candidate(
             "another protocol",
-            f"read as {name}{also}{width} {numbers} ({said})",
+            f"read as {name}{also}{width} {numbers} ({given})",
             words={"settings": f'protocol = "{name}"{setting}'},
         )
 
@@ -282,11 +286,11 @@ def _unit(metres: Floats, others: Floats) -> str | None:
     """Return the unit of others (n,) in which they agree best with metres (n,); None if metres are as good."""
     left = {name: robust_spread(metres - others / many) for name, many in UNITS_A_METRE.items()}
     best = min(left, key=lambda name: left[name])
-    # Distances that say nothing are best when they are divided by most.
-    # Feet taken for metres leave two thirds of the ranges' own spread, the right unit noise and delays.
+    # Distances unrelated to the ranges fit best with the largest divisor. Feet taken for metres leave two thirds of the
+    # ranges' own spread; the right unit leaves noise and delays.
     if left[best] < 0.5 * min(robust_spread(metres - others), robust_spread(metres)):
         return best
-    # Of one distance, the unit that makes both alike.
+    # With one distance, the unit that makes both equal.
     if robust_spread(metres) > 0.5 or np.median(others) < PLAUSIBLE_M:
         return None
     return min(UNITS_A_METRE, key=lambda name: abs(float(np.median(metres - others / UNITS_A_METRE[name]))))
@@ -302,7 +306,7 @@ def powers(view: RecordingView) -> Iterator[Candidate]:
     middle = float(np.median(every[given]))
     guess, factor = "no usual factor explains them", "give fpp1 and fpp2 in dBm"
     for name, times in POWER_FACTORS.items():
-        # From their sensitivity to a metre apart.
+        # From the sensitivity to the power at one metre.
         if -115 < times * middle < -55:
             guess = f"they are probably {name}: multiplied by {times:g} they would be {times * middle:.0f} dBm"
             factor = f"multiply fpp1 and fpp2 by {times:g}"
@@ -362,9 +366,9 @@ def missing(view: RecordingView) -> Iterator[Candidate]:
 def confounded(view: RecordingView) -> Iterator[Candidate]:
     """Find power that depends only on distance: then a curve over power cannot be separated from distance.
 
-    The scatter of readings is no power that varies, and is taken off: readings of a pair within 0.2 s, in which a robot
-    turns its antenna by a few degrees, differ by their noise. So is what groups of distances explain by chance, as
-    powers of a pair within 2 s, in which it turns, are nearly one (adjusted share).
+    The noise of readings is subtracted from the variance of powers: readings of a pair within 0.2 s, in which a robot
+    turns its antenna by a few degrees, differ by noise. The share that groups of distances explain by chance is also
+    subtracted (adjusted share): powers of a pair within 2 s count as nearly one.
     """
     lifted = lifted_power(view.ranges.fpp1_dbm, view.ranges.fpp2_dbm, "mean-of-lifted", ALPHA_DBM)
     rows = np.flatnonzero(np.isfinite(lifted) & (view.ranges.truth_m > 0))
@@ -375,7 +379,7 @@ def confounded(view: RecordingView) -> Iterator[Candidate]:
     pair, time_ns, shares, groups = pairs[rows], view.exchanges.time_ns[rows], [0.0], 40
     alone = len(np.unique(np.column_stack([pair, time_ns // 2_000_000_000]), axis=0))
     together = (np.diff(pair) == 0) & (np.diff(time_ns) < 200_000_000)
-    # Lifted powers at short distances dominate; decibels do not. Either share can be too large.
+    # Lifted powers are dominated by short distances, decibels are not. Either share can be too large.
     for power in (lifted[rows], np.log(lifted[rows])):
         noise = float(np.mean(np.diff(power)[together] ** 2)) / 2 if np.count_nonzero(together) >= 100 else 0.0
         parts = np.array_split(power[np.argsort(view.ranges.truth_m[rows], kind="stable")], groups)
@@ -383,7 +387,7 @@ def confounded(view: RecordingView) -> Iterator[Candidate]:
         if between > within:
             share = between / (between + max(within - noise, 0.0))
             shares.append(1 - (1 - share) * max(alone - 1, groups) / max(alone - groups, 1))
-    # Beyond, what is fitted over power has ten times its own variance (variance inflation, Marquardt 1970).
+    # Above this share, the variance of a curve over power is ten times as large (variance inflation, Marquardt 1970).
     if max(shares) > 0.9:
         yield Candidate(
             "power confounded with distance", f"distance explains {100 * max(shares):.0f} % of the power's variance"
@@ -393,7 +397,7 @@ def confounded(view: RecordingView) -> Iterator[Candidate]:
 def swapped_roles(view: RecordingView) -> Iterator[Candidate]:
     """Find carrier readings and stamps that disagree about which clock of a pair is faster.
 
-    The readings' own offset of a tenth of a ppm, which is no noise, hides no slope of 1.
+    The readings' constant offset of a tenth of a ppm does not hide a slope of 1.
     """
     known = [one for one in clock_skews(view.exchanges) if one.count > 15 and one.carrier_ppm is not None]
     stamps, readings, spread, count = np.array(
@@ -405,7 +409,7 @@ def swapped_roles(view: RecordingView) -> Iterator[Candidate]:
         return
     slope = float(weight @ (stamps * readings)) / square
     left = float(np.mean((readings - slope * stamps) ** 2 * weight))
-    # Half a slope is halfway between what is right and what is swapped.
+    # A slope of a half is halfway between right and swapped roles.
     if slope < -0.5:
         yield Candidate(
             "swapped roles",
@@ -430,10 +434,10 @@ def carriers(view: RecordingView) -> Iterator[Candidate]:
         if one.residual_ppm and one.count >= 100
     )
     if known:
-        # That of most pairs: one board that scatters is not the unit of all.
+        # The scatter of most pairs: one noisy board is not the reference for all.
         scatter, count, pair = known[(len(known) - 1) // 2]
-        # Of the logarithm of a median absolute deviation (efficiency 0.37).
-        # Of a sound board: a reply of 1.5 ms then adds a third of a metre to a range.
+        # Standard error of the logarithm of a median absolute deviation (efficiency 0.37). Limit for a sound board:
+        # with a reply of 1.5 ms it adds a third of a metre to a range.
         p_value = exceeds(max(np.log(scatter / 1.5), 0.0), float(1 / np.sqrt(2 * 0.37 * count)), np.inf)
         yield Candidate(
             "carrier readings that say little",

@@ -1,8 +1,7 @@
 """The table of checks, each with its question, statistic, distribution on sound data and remedies; `examine` runs it.
 
-Checks of geometry suspect the true distances (poses, lever arms, ids, clocks), and work by trial: they undo a suspected
-fault, and report it if the ranges then agree better with the distances; of several, the one that explains most is
-reported.
+Checks of geometry test the true distances (poses, lever arms, ids, clocks) by trial: they undo a suspected fault, and
+report it if the ranges then agree better with the distances; of several faults, the one that explains most is reported.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from calib.surveys.survey import survey
 
 
 def surveyed(recordings: list[Data]) -> Iterator[Candidate]:
-    """Yield the faults that a survey of recordings finds: in known facts, positions and powers.
+    """Yield the faults that a survey of recordings finds in known facts, positions and powers.
 
     The survey has tested these itself, so they are not tested again.
     """
@@ -399,7 +398,7 @@ have the other."""
 
 OF_PAIRS: Final = {"pairs that do not close", "places that do not close", "reflections", "reflections that last"}
 IMPLIED: Final = {
-    # Where nothing moves, every pair has one distance and one power, and the one explains the other.
+    # If nothing moves, every pair has one distance and one power, so distance explains power.
     "static data": {"power confounded with distance"},
     "anchor stands elsewhere": {"pairs that do not close"},
     "delay changed mid-flight": OF_PAIRS,
@@ -415,7 +414,7 @@ IMPLIED: Final = {
 """Faults that are consequences of another fault, and are not reported together with it."""
 
 
-# Small matrices: several threads make them slower, and the last digits another.
+# Small matrices: several threads are slower, and change the last digits.
 @threadpool_limits.wrap(limits=1, user_api="blas")  # type: ignore[untyped-decorator]  # it has no types
 def examine(data: Data | Iterable[Data]) -> list[Finding]:
     """Return the faults of a recording, the most serious first, each with its evidence and remedy.
@@ -440,7 +439,7 @@ def examine(data: Data | Iterable[Data]) -> list[Finding]:
         views += [view] if view else []
     if len(views) > 1:
         between = _run_stage("between", views, FINDING_LEVEL)
-        # What moved between two recordings is no fault of either one.
+        # Changes between two recordings are not faults of either one.
         moved = any(finding.fault == "anchor moved between recordings" for finding in between)
         findings = [one for one in findings if not (moved and one.fault == "anchor stands elsewhere")] + between
     if views and len(views) == len(recordings) and all(view.standing for view in views):
@@ -458,12 +457,12 @@ def _run_stage(stage: str, *given: Any) -> list[Finding]:
 def _examine_recording(view: RecordingView) -> tuple[list[Finding], RecordingView | None]:
     """Return the faults of one recording, and the recording without its impossible rows, if it can be used."""
     for check in CHECKS:
-        # With such a fault, the other numbers of a recording mean something else.
+        # With such a fault, the other numbers of a recording have another meaning.
         if check.stage == "reading" and (misread := check.findings(check.look(view), FINDING_LEVEL)):
             return misread, None
     findings = _run_stage("rows", view)
     bad = columns.impossible(view)
-    # The rest may be possible by chance.
+    # The remaining rows may be possible only by chance.
     if bad.mean() >= 0.5:
         return findings, None
     view = view.chosen(~bad)

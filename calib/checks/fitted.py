@@ -1,7 +1,7 @@
-"""Checks of a fit by its residuals: is one more unknown significant, and how much would it change the delays?
+"""Checks of a fit by its residuals: whether one more unknown is significant, and its effect on the delays.
 
-All questions share one false-alarm budget. Offsets that are draws of one variance (pairs, sessions) are unknowns of the
-fit, so their variance is in the intervals whether one of them stands out or not.
+All tests share one false-alarm budget. Random offsets with one variance (pairs, sessions) are unknowns of the fit, so
+the intervals always include their variance.
 """
 
 from __future__ import annotations
@@ -29,23 +29,24 @@ from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
 OFFSET_SPANS, SPAN_S = 6, 20.0
-"""Spans of time in which a tag may have an offset of its own, and how long they are at least: twice the longest memory
-of errors in the worlds of `make worlds`, so that it is known within them. Six place a touch to a sixth of the time."""
+"""Number of spans of time in which a tag may have an offset, and their minimum length: twice the longest memory of
+errors in the worlds of `make worlds`, so that the memory can be estimated within a span. Six spans locate a change to a
+sixth of the time."""
 
 MATTERS, CLEARLY = 1.0, 4.0
-"""A finding is named that moves some delay by so many of its standard errors (by less, it is within the interval), a
-small one by so many (one in 16 000 by chance)."""
+"""A finding is named if it moves some delay by this number of standard errors (a smaller effect is within the
+interval); a small offset needs the second number (one in 16 000 by chance)."""
 
 SMALLEST_M = 0.01
-"""A smaller offset may come from a lever arm measured by a ruler: it widens intervals, and is named only if its effect
-is large."""
+"""A smaller offset may be an error of a lever arm measured by a ruler: it widens intervals, and is named only if its
+effect is large."""
 
 HIDDEN, OFTEN = 0.8, 0.45
-"""Shares of reflected ranges of a pair that is named, and of a tag's pairs on average. Judgements: delays rest on the
-direct ranges."""
+"""Shares of reflected ranges from which a pair is named, and a tag (mean of its pairs). Judgements: delays depend on
+the direct ranges."""
 
 UNIT = np.ones((1, 1))
-"""The derivative of a range by an offset of it."""
+"""The derivative of a range by its own offset."""
 
 
 def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
@@ -58,10 +59,10 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
     readings = None if alone else errors_of_readings(found.model, louder)
     tested = slopes.tests(list(families(found, louder, beside_curve=not alone)), readings)
     if readings is not None:
-        # Powers are read with noise in every recording, and alternatives are tested beside it.
+        # Every recording has noise of powers, and alternatives are tested with it fitted.
         noise = replace(tested[-1], family=replace(tested[-1].family, kind="readings", names=["readings"]))
-        noise = noise.turned(np.eye(len(noise.total))[-1:])
-        tested = [*(one.beside([-1]).turned(np.eye(len(one.total))[:-1]) for one in tested), noise]
+        noise = noise.combined(np.eye(len(noise.total))[-1:])
+        tested = [*(one.with_fitted([-1]).combined(np.eye(len(one.total))[:-1]) for one in tested), noise]
     if found.slopes_of_heard is not None:
         tested += found.slopes_of_heard.tests(list(_of_heard(found)))
     findings = _without_explained(search(tested, OF_A_FIT))
@@ -69,12 +70,12 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
     for one in tested:
         if one.family.kind in ("pair", "session") and not len(one.family.fitted):
             plain = plain + widening(one)
-    places_ns2, said = np.zeros_like(plain), list[str]()
+    places_ns2, of_places = np.zeros_like(plain), list[str]()
     if not alone and found.model.curve is not None:
         pairs = next(one for one in tested if one.family.kind == "pair")
-        places_ns2, said = place_covariance(found, slopes, pairs, plain)
-    covariance, sentences = _covariance_and_sentences(plain, findings, places_ns2, said)
-    # Few pairs tell little of how large their offsets are. What findings added already is not added again.
+        places_ns2, of_places = place_covariance(found, slopes, pairs, plain)
+    covariance, sentences = _covariance_and_sentences(plain, findings, places_ns2, of_places)
+    # Few pairs determine the size of their offsets poorly. Variance that findings added already is not added again.
     optimum = found.searches[0].optimum
     few_ns2 = of_few_draws(optimum, optimum.layout.indices(["delay"]))
     covariance = covariance + positive_part(few_ns2 - (covariance - found.covariances["delay"]))
@@ -89,12 +90,12 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
 
 def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> Iterator[Family]:
     """Yield the alternatives: offsets of a pair, of a tag for a while, of either in one of several sessions, of a tag
-    as its power changes, and those of arithmetic.
+    with its power, and of all ranges together.
 
-    `louder_m` (n,) is what a decibel more would do to each range. Where no curve is fitted, errors of all tags may
-    change with power alike, which is no tag's fault. Then one of the opposite sign with the other tag initiating, as a
-    clock leaves it whose skew is not corrected, and what all ranges share. A fit whose curve comes after its delays is
-    not `beside_curve`: the curve is in its errors, and follows distance as power does.
+    `louder_m` (n,) is the change of each range by a decibel more. Without a curve, errors of all tags may change
+    equally with power, which is not a fault of one tag. Then follow an offset whose sign changes with the initiator, as
+    by uncorrected clock skew, and offsets common to all ranges. A fit whose curve is fitted after its delays is not
+    `beside_curve`: its errors contain the curve, which depends on distance like power.
     """
     model, ranges, count = found.model, found.model.ranges, len(found.model.ranges)
     tags = [f"tag {tag}" for tag in model.tags]
@@ -132,7 +133,9 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
 
 
 def _of_heard(found: KnownDistances) -> Iterator[Family]:
-    """Yield offsets of differences of arrival: of targets, which their ranges contradict, and of paths to listeners."""
+    """Yield offsets of differences of arrival: of targets, if their ranges contradict these, and of paths
+    to listeners.
+    """
     search = found.searches[0]
     arrivals = search.arrivals
     if arrivals is not None:
@@ -156,14 +159,14 @@ def of_pairs(found: KnownDistances) -> Family:
 
 
 def _of_sessions(found: KnownDistances, tags: list[str], ends: Ints) -> Family:
-    """Return offsets of tags, and of pairs, in one session; those of tags alone where time is short for both.
+    """Return offsets of tags, and of pairs, in one session; only of tags if the time is too short for both.
 
-    Between sessions antennas are taken off and screwed on, and things are moved.
+    Between sessions antennas are removed and mounted, and objects are moved.
     """
     model, sessions = found.model, found.model.ranges.sessions
     names, columns = tags, ends
     kinds, count = ["offset of tag in session", "offset of pair in session"], len(sessions)
-    # The covariance of so many slopes must be known from blocks of time.
+    # The blocks of time must determine the covariance of this number of slopes.
     if (len(tags) + len(model.pairs.ends)) * count < found.blocks.count / 2:
         names = [*tags, *of_pairs(found).names]
         columns = np.column_stack([ends, model.pairs.number + len(tags)])
@@ -179,12 +182,12 @@ def _of_sessions(found: KnownDistances, tags: list[str], ends: Ints) -> Family:
 
 
 def errors_of_readings(model: RangeModel, louder_m: Floats) -> Floats | None:
-    """Return the error (n,) that noise of power readings leaves, over its root mean square; None where there is none.
+    """Return the error (n,) by noise of power readings, divided by its root mean square; None if there is none.
 
-    The error that goes with the power itself is left in part, and goes with what distance lets expect of the power
-    beyond what was read (regression calibration: Carroll et al. 2006, chapter 4). Without it ranges seem to grow with
-    the distance, or pairs at some distances to have offsets; much noise leaves more than is linear in it, so that it is
-    named beside such findings.
+    A part of the error that depends on power remains; it is proportional to the difference between the power expected
+    from distance and the reading (regression calibration: Carroll et al. 2006, chapter 4). Without this alternative
+    ranges seem to grow with distance, or pairs at some distances seem to have offsets. Large noise also leaves a
+    non-linear part, so it is named together with such findings.
     """
     if not np.any(louder_m) or not np.ptp(model.ranges.truth_m) > 0:
         return None
@@ -196,17 +199,17 @@ def errors_of_readings(model: RangeModel, louder_m: Floats) -> Floats | None:
 
 
 def distance_speeds(model: RangeModel) -> dict[str, Floats]:
-    """Return the speed at which the true distance of each range (n,) changes, divided by its root mean square.
+    """Return the rate of change of the true distance of each range (n,), divided by its root mean square.
 
-    Speeds are those by the neighbours of each pair; nothing is returned where no distance changes.
+    Speeds are computed from neighbouring ranges of each pair; None if no distance changes.
     """
     ranges, pair = model.ranges, model.pairs.number
     order = np.argsort(pair, kind="stable")
     time_s, truth_m = ranges.time_ns[order] * 1e-9, ranges.truth_m[order]
     same = (np.diff(pair[order]) == 0) & (np.diff(ranges.session[order]) == 0)
-    # Two ranges of a pair further apart say nothing of a speed: bodies turn round within seconds.
+    # Two ranges of a pair further apart do not determine a speed: bodies turn round within seconds.
     near = same & (np.diff(time_s) > 0) & (np.diff(time_s) < 1.0)
-    # From the neighbour before to the one after, or what there is of both.
+    # From the previous neighbour to the next one, or from the only one.
     run, way = (np.convolve(np.where(near, np.diff(one), 0.0), [1.0, 1.0]) for one in (time_s, truth_m))
     speeds = np.empty(len(order))
     speeds[order] = way / np.where(run > 0, run, 1.0)
@@ -219,7 +222,7 @@ def _root_mean_square(values: Floats) -> float:
 
 
 def change_per_decibel(found: KnownDistances) -> Floats:
-    """Return the change of ranges (n,) if their powers were a decibel higher."""
+    """Return the change of ranges (n,) for powers that are a decibel higher."""
     curves, lifted = list(bias_curves(found).values()), found.model.lifted
     return np.asarray(np.mean([curve(10**0.1 * lifted) - curve(lifted) for curve in curves], axis=0))
 
@@ -237,33 +240,33 @@ def _without_explained(findings: list[FoundOffset]) -> list[FoundOffset]:
 def _covariance_and_sentences(
     plain: Floats, findings: list[FoundOffset], places_ns2: Floats, of_places: list[str]
 ) -> tuple[Floats, list[str]]:
-    """Return the delays' covariance (tags, tags) with what findings add, and those that matter as sentences.
+    """Return the delays' covariance (tags, tags) including findings, and sentences about findings that matter.
 
     `of_places` is a sentence on errors of places, if they are certain; `places_ns2` (tags, tags) is their covariance.
     """
     if of_places:
-        # Offsets of pairs are then draws like the others; one of them is no fault of its own.
+        # Offsets of pairs are then random like the others; a single one is not a separate fault.
         findings = [one for one in findings if one.kind != "pair"]
-    covariance, matter, said = plain + places_ns2, dict[tuple[str, tuple[str, ...]], FoundOffset](), of_places
+    covariance, matter, places = plain + places_ns2, dict[tuple[str, tuple[str, ...]], FoundOffset](), of_places
     for one in findings:
         moved, large = _largest_shift(one, plain), abs(one.offset_m) > SMALLEST_M
-        # True distances of another time or scale than ranges move ranges, and hardly delays.
+        # True distances of another time or scale change ranges, but hardly delays.
         cause = one.kind == "shared" and (bool(of_places) or large)
         if moved > MATTERS:
             covariance = covariance + one.spread_ns2
         if cause and "late" in one.names:
-            # Ranges of two bodies are wrong together then, too: the narrower cause is named.
-            said = []
+            # Then ranges between two bodies are wrong together, too: the more specific cause is named.
+            places = []
         large = large or (moved > CLEARLY and one.largest_ns > SMALLEST_NS)
-        # Powers that are read with noise: the curve is right for the powers that are read.
+        # With noise of power readings the curve is right for the powers as read.
         if one.kind != "readings" and (cause or (moved > MATTERS and large)):
-            # A tag that was moved stands out in more than one span of time: once is enough.
+            # A tag that was moved is significant in more than one span of time: it is named once.
             matter.setdefault((one.kind, one.names), one)
     noise = ""
     if any(one.kind == "readings" for one in findings):
         noise = "; or the powers are noisy, which has the same effect: turn the antennas while recording"
     return covariance, [
-        *(sentence + noise for sentence in said),
+        *(sentence + noise for sentence in places),
         *(sentence_of(one) + noise * (one.kind == "shared") for one in matter.values()),
     ]
 
@@ -272,11 +275,11 @@ def _largest_shift(finding: FoundOffset, covariance: Floats) -> float:
     """Return the largest shift of a delay by a finding, in standard errors of the delay."""
     std = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
     if not np.any(np.diag(covariance) > 0):
-        # Without a delay in the fit the curve takes what an offset does.
+        # Without delays in the fit the curve absorbs an offset.
         return abs(finding.offset_m) > SMALLEST_M
     if finding.kind == "time":
-        # A delay that was another one for a while is wrong by as much, then or at other times. The printed interval has
-        # grown with it already: what does not return looks like an error that lasts.
+        # A delay that changed for a while is wrong by this change, then or at other times. The printed interval already
+        # includes it: a permanent change looks like an error that lasts.
         return 2e9 * abs(finding.offset_m) / SPEED_OF_LIGHT / float(np.median(std))
     return float(np.max(np.abs(finding.effects_ns) / std, initial=0.0))
 
@@ -322,10 +325,10 @@ def sentence_of(finding: FoundOffset) -> str:
 
 
 def _reflection_warnings(found: KnownDistances) -> Iterator[str]:
-    """Return sentences about pairs with hardly any direct range, or else about a tag with about half of its ranges
+    """Return sentences about pairs with hardly any direct range, or otherwise about a tag with about half of its ranges
     reflected.
 
-    The log odds of a pair are held against their standard errors, with errors that last.
+    The log odds of a pair are compared with their standard errors, including errors that last.
     """
     values, optimum, ends = found.values, found.searches[-1].optimum, found.model.pairs.ends
     if not isinstance(found.searches[-1].rows.errors, Mixture) or "odds of pair" not in values:
@@ -341,7 +344,7 @@ def _reflection_warnings(found: KnownDistances) -> Iterator[str]:
     for number in hidden:
         a, b = ends[number].tolist()
         others = [tag for tag in tags if tag not in (a, b)]
-        # Among four tags a pair's offset and that of the two others leave the same trace.
+        # With four tags, offsets of a pair and of the pair of the other two have the same effect.
         either = f" or pair {others[0]}-{others[1]}" if len(tags) == 4 else ""
         yield (
             f"pair {a}-{b}{either}: {100 * share[number]:.0f} % of its ranges are reflected, or "
@@ -354,7 +357,7 @@ def _reflection_warnings(found: KnownDistances) -> Iterator[str]:
 
 
 def _persistence_warning(found: KnownDistances) -> Iterator[str]:
-    """Return a sentence if errors last so long that a recording has few independent stretches of time."""
+    """Return a sentence if errors last so long that there are few independent stretches of time."""
     lasting = found.persistence
     if lasting.stretches < FEWEST_STRETCHES:
         yield (
@@ -366,8 +369,8 @@ def _persistence_warning(found: KnownDistances) -> Iterator[str]:
 
 def _redundancy_warning(model: RangeModel) -> Iterator[str]:
     """Return a sentence if there are so few pairs that offsets of pairs cannot be separated from delays."""
-    count, told = len(model.pairs.ends), any(unknown.kind == "offset of pair" for unknown in model.unknowns)
-    if model.settings.constants == "tag" and count > 2 and not told:
+    count, fitted = len(model.pairs.ends), any(unknown.kind == "offset of pair" for unknown in model.unknowns)
+    if model.settings.constants == "tag" and count > 2 and not fitted:
         slopes = 0.5 * METRES_A_NS * free_ends(model.pairs, model.tags, model.settings)
         moved_ns = TYPICAL_OFFSET_M * float(np.linalg.norm(np.linalg.pinv(slopes), axis=1).max())
         yield (
@@ -381,8 +384,8 @@ def _redundancy_warning(model: RangeModel) -> Iterator[str]:
 def _confounding_warning(found: KnownDistances, slopes: Slopes) -> Iterator[str]:
     """Return a sentence if a small error proportional to distance cannot be separated from a curve over power.
 
-    The curve is fitted beside such an error of 1 %, which true distances may have without showing it (a judgement). It
-    is named where it adds more to the variance of the curve than all else does.
+    The curve is fitted with such an error of 1 %, which true distances may have unnoticed (a judgement). It is named if
+    it adds more to the variance of the curve than all other errors.
     """
     model, truth_m = found.model, found.model.ranges.truth_m
     if model.curve is None or len(found.searches) > 1 or not np.ptp(truth_m) > 0:
@@ -390,7 +393,7 @@ def _confounding_warning(found: KnownDistances, slopes: Slopes) -> Iterator[str]
     far = truth_m - np.median(truth_m)
     link = slopes.link(sparse.csr_matrix(far[:, None]))[0]
     taken = np.asarray(slopes.optimum.covariance @ link)
-    own = float(slopes.tells @ far[slopes.order] ** 2)
+    own = float(slopes.information @ far[slopes.order] ** 2)
     known = (own - float(taken @ link)) / found.persistence.factor
     slope = 1 / np.sqrt(0.01**-2 + max(known, 0.0))
     rows = basis(np.quantile(model.lifted, np.linspace(0.02, 0.98, 25)), model.curve.knots)

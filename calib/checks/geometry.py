@@ -31,21 +31,21 @@ from uwblink.twr import names_in
 def pose_clock(view: RecordingView) -> Iterator[Candidate]:
     """Find poses whose clock is off by up to a few seconds."""
     fit = view.quick_fit
-    # Where poses are late, by less than bodies take for a turn, ranges follow the speeds at which distances change.
+    # If poses are late, by less than the time of a turn, errors of ranges are proportional to the speeds of distances.
     follow = [fit.offset(speeds)[1] for speeds in distance_speeds(fit.model).values()] if fit else [0.0]
     if not len(view.poses) or min(follow, default=1.0) > BUDGET:
         return
-    # By how much is a search: motion over a second is not linear.
+    # The offset is found by a search, because motion over a second is not linear.
     try:
         offset_ns = find_offset(view.exchanges, view.poses, view.tags, within_s=3.0)
     except ImportTableError:
         return
     shift_s, e = offset_ns * 1e-9, view.exchanges
-    # Host times of ranges are as late as USB makes them, and poses as a camera's exposure and network.
+    # Host times of ranges are late by USB, poses by exposure and network of the cameras.
     if abs(shift_s) > 0.03:
         moved = distances_m(view.poses, view.tags, e.initiator, e.target, e.time_ns - offset_ns)
         evidence = f"with the poses {shift_s:+.3f} s later"
-        yield _undone(view, Candidate("pose time offset", evidence, words={"shift": f"{shift_s:.3f}"}), moved)
+        yield _with_spreads(view, Candidate("pose time offset", evidence, words={"shift": f"{shift_s:.3f}"}), moved)
 
 
 def frozen_poses(view: RecordingView) -> Iterator[Candidate]:
@@ -76,7 +76,7 @@ def frozen_poses(view: RecordingView) -> Iterator[Candidate]:
         f"{100 * float(np.median(spread_m)):.0f} cm instead of {100 * usual_m:.1f} cm",
         # A body that stands still repeats its poses, too; its errors spread as at other times.
         positive(np.log(spread_m) - np.log(2 * usual_m)),
-        gain=_gain(error_m[rows], np.full(len(rows), usual_m)),
+        gain=_common_decrease_m(error_m[rows], np.full(len(rows), usual_m)),
     )
 
 
@@ -85,7 +85,7 @@ def _trials(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]
     for body in sorted({tag.body for tag in view.tags}):
         arms = {tag.tag: np.array(tag.lever_arm_m) for tag in view.tags if tag.body == body}
         longest = max(np.linalg.norm(arm) for arm in arms.values())
-        # Robots that carry these boards are smaller than a metre: mm, cm or inches.
+        # Robots with these boards are smaller than a metre: mm, cm or inches.
         units = [("lever arm unit", length) for length in (0.001, 0.01, 0.0254) if longest > 1.0]
         for fault, length in [("lever arm sign", -1.0)] * bool(longest > 0) + units:
             seen = Candidate(fault, f"of body {body}: times {length:g}", words={"body": body, "length": length})
@@ -98,9 +98,10 @@ def _trials(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]
 
 
 def _displacements(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]:
-    """Bodies that move, and tags on them, where their ranges fit best, each with poses and tags as they would be then.
+    """Yield moving bodies and tags on them at the positions that fit their ranges best, each with the changed poses and
+    tags.
 
-    What is nearer than twice `TOLERANCE_M` may be an antenna whose delay depends on the direction.
+    A displacement below twice `TOLERANCE_M` may be a delay that depends on direction.
     """
     if (fit := view.quick_fit) is None:
         return
@@ -109,7 +110,7 @@ def _displacements(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list
     arms = {f"tag {tag.tag}": tag for tag in view.tags if tag.body not in standing}
     ends = {name: np.stack([e.initiator == tag.tag, e.target == tag.tag], axis=1) for name, tag in arms.items()}
     sides = {name: -away_m[:, None] * np.where(own[..., None], ways, 0.0).sum(axis=1) for name, own in ends.items()}
-    for name, side in (sides | _sides(view, fit, {tag.body for tag in arms.values()})).items():
+    for name, side in (sides | _vectors_to_bodies(view, fit, {tag.body for tag in arms.values()})).items():
         rows = side.any(axis=1)
         if np.count_nonzero(rows) < 200:
             continue
@@ -206,26 +207,26 @@ def geometry(view: RecordingView) -> Iterator[Candidate]:
     for suspected in ((_trials,), (_displacements, _turns)) if view.posed else ():
         e, trials = view.exchanges, [one for some in suspected for one in some(view)]
         found = [
-            _undone(view, seen, distances_m(poses, tags, e.initiator, e.target, e.time_ns), tried=len(trials))
+            _with_spreads(view, seen, distances_m(poses, tags, e.initiator, e.target, e.time_ns), tried=len(trials))
             for seen, poses, tags in trials
         ]
-        # Where a simple fault explains the ranges, any place is fitted in vain.
+        # If a simple fault explains the ranges, positions need not be fitted.
         if sure := [one for one in found if one.p_value < BUDGET]:
             yield max(sure, key=lambda one: one.gain)
             return
 
 
-def _undone(view: RecordingView, seen: Candidate, truth_m: Floats, *, tried: int = 1) -> Candidate:
-    """Return a suspected fault with how the spread of ranges changes with the true distances (n,) without it.
+def _with_spreads(view: RecordingView, seen: Candidate, truth_m: Floats, *, tried: int = 1) -> Candidate:
+    """Return a suspected fault with the change of the spread of ranges for the true distances (n,) without it.
 
-    The statistic is the logarithm of how much wider they spread before, by stretches of time. Undoing a fault that
-    narrows ranges by less than a twentieth is not worth a word: curves that are left in do that.
+    The statistic is the logarithm of the ratio of spreads before and after, by stretches of time. A fault that changes
+    the spread by less than a twentieth is not reported: curves that were not removed have such an effect.
     """
     before, after = (view.less_pairs(view.ranges.raw_m - true) for true in (view.ranges.truth_m, truth_m))
     known = np.isfinite(before) & np.isfinite(after)
     rows = np.flatnonzero(known & (np.abs(view.ranges.truth_m - truth_m) > 1e-3))
     rows = rows[np.argsort(view.exchanges.time_ns[rows], kind="stable")]
-    # A tag that ranges with two others has 80 ranges in a quick fit: eight stretches of ten.
+    # A tag that ranges with two others has at least 80 ranges in a quick fit: eight stretches of ten.
     cuts = [rows[cut] for cut in stretches(len(rows), fewest=10)]
     if not cuts:
         return replace(seen, p_value=1.0)
@@ -235,25 +236,25 @@ def _undone(view: RecordingView, seen: Candidate, truth_m: Floats, *, tried: int
         seen,
         evidence=f"{seen.evidence}, the spread of the ranges is {new_cm:.1f} cm instead of {old_cm:.1f} cm",
         p_value=positive(np.log(0.95) + np.log(old) - np.log(new), tried=tried),
-        gain=_gain(before[rows], after[rows]),
+        gain=_common_decrease_m(before[rows], after[rows]),
     )
 
 
-def _gain(before_m: Floats, after_m: Floats) -> float:
-    """Return by how much errors (n,) shrink together, metres; errors of 10 m are as bad as any larger ones."""
+def _common_decrease_m(before_m: Floats, after_m: Floats) -> float:
+    """Return the common decrease of errors (n,) in metres; errors above 10 m count as 10 m."""
     return float(np.nansum(np.minimum(np.abs(before_m), 10.0) - np.minimum(np.abs(after_m), 10.0)))
 
 
 TOLERANCE_M: Final = 0.05
-"""What a place by tape or markers is off by, with the antenna beside the marker: the size of a board."""
+"""Standard deviation of a position by tape or markers, with the antenna beside the marker: the size of a board."""
 
 PAIR_M: Final = 0.04
-"""What lever arms by a ruler and phase centres of antennas do to a pair: 2 cm at either end."""
+"""Standard deviation of a pair's error by lever arms from a ruler and phase centres of antennas: 2 cm at either end."""
 
 
 def anchors(view: RecordingView) -> Iterator[Candidate]:
     """Find exchanged tags; then anchors at other positions, with the displacement `away_m` (3,) in the candidate."""
-    # Where nothing moves, each pair has a level that is its own.
+    # If nothing moves, each pair has its own level.
     if view.standing_m is not None or view.quick_fit is None:
         return
     moved, seen = _exchanged(view, view.quick_fit)
@@ -271,20 +272,20 @@ def anchors(view: RecordingView) -> Iterator[Candidate]:
     if view.posed and view.quick_fit is not None:
         yield from _displaced(view, view.quick_fit)
     elif len(view.poses):
-        # A table's own true distances are used, and its poses are what places tags when ranges are.
+        # True distances of a table are used as they are; its poses are the positions of tags at the times of ranges.
         by_poses = anchors(_with_truth(view, posed=True))
         yield from (replace(one, evidence=f"by the poses, {one.evidence}") for one in by_poses)
 
 
-def _with_truth(view: RecordingView, **said: Any) -> RecordingView:
+def _with_truth(view: RecordingView, **changes: Any) -> RecordingView:
     """Return a view with other poses or tags, and true distances by them."""
-    told, e = replace(view, **said), view.exchanges
-    truth_m = distances_m(told.poses, told.tags, e.initiator, e.target, e.time_ns)
-    return replace(told, ranges=replace(view.ranges, truth_m=truth_m))
+    changed, e = replace(view, **changes), view.exchanges
+    truth_m = distances_m(changed.poses, changed.tags, e.initiator, e.target, e.time_ns)
+    return replace(changed, ranges=replace(view.ranges, truth_m=truth_m))
 
 
 def _line(view: RecordingView, tag: Tag, away_m: Floats | float = 0.0) -> str:
-    """Return a tag as it stands in a map: an anchor where its body stands, displaced by `away_m` (3,)."""
+    """Return a tag as a line of a map: an anchor at its body's position, displaced by `away_m` (3,)."""
     if tag.body not in places_m(view):
         return f"\n[[tags]]\nid = {tag.tag}\nbody = {tag.body!r}\nlever_arm_m = {list(tag.lever_arm_m)}"
     (place,) = antennas_m(view.poses, [tag], np.array([tag.tag]), view.poses.time_ns[view.poses.body == tag.body][:1])
@@ -294,10 +295,10 @@ def _line(view: RecordingView, tag: Tag, away_m: Floats | float = 0.0) -> str:
 def _exchanged(view: RecordingView, fit: QuickFit) -> tuple[dict[int, int], Candidate]:
     """Yield the finding of exchanged tags, with the exchange that undoes it.
 
-    A tag a at the place of b ranges with c as far as b is from c, by the true distances of b and c, which are
-    interpolated. The logarithms of the pairs' spreads are the likelihood, were each scale its own: an assignment of
-    tags to places finds the likeliest exchange of any number of them. In each of its cycles one tag, of all at all
-    places, must pass a test of its own.
+    If tag a is at the place of b, its ranges to c are the distances from b to c, which are interpolated from the true
+    distances of b and c. The log likelihood is the sum of the logarithms of the pairs' spreads, with a separate scale
+    for each; an assignment of tags to places finds the likeliest exchange of any number of tags. In each cycle of the
+    exchange one tag must pass a separate test among all tags at all places.
     """
     ranges, pairs, numbers = fit.model.ranges, fit.model.pairs, np.unique(fit.ends)
     count, right, ends = len(numbers), np.arange(len(numbers)), np.searchsorted(numbers, pairs.ends).tolist()
@@ -310,8 +311,12 @@ def _exchanged(view: RecordingView, fit: QuickFit) -> tuple[dict[int, int], Cand
         mended, moved = view.ranges.truth_m.copy(), at != right
         for (a, c), own in rows.items():
             mended[fit.rows[own]] = truth_m(own, rows.get((at[a], at[c]), own))
-        said = [f"{a} is at the given position of {b}" for a, b in zip(numbers[moved], numbers[at[moved]], strict=True)]
-        return _undone(view, Candidate("swapped tag ids", f"tag {', '.join(said)}: undone"), mended, tried=count**2)
+        texts = [
+            f"{a} is at the given position of {b}" for a, b in zip(numbers[moved], numbers[at[moved]], strict=True)
+        ]
+        return _with_spreads(
+            view, Candidate("swapped tag ids", f"tag {', '.join(texts)}: undone"), mended, tried=count**2
+        )
 
     known, spread, worse = sums = np.zeros((3, count, count))
     for (a, c), own in rows.items():
@@ -320,7 +325,8 @@ def _exchanged(view: RecordingView, fit: QuickFit) -> tuple[dict[int, int], Cand
             if (b, c) in rows:
                 there = np.log(robust_spread(ranges.raw_m[own] - truth_m(own, rows[b, c])) + 1e-6)
                 sums[:, a, b] += len(own) * np.array([1.0, there, there - usual])
-    # At its own place a tag's ranges are not astray, and what narrows them by a twentieth is not worth a word.
+    # The spread at the own place is below `ASTRAY_M`; an exchange that reduces spreads by less than a twentieth is not
+    # reported.
     possible = (known > 0.25 * known.diagonal()[:, None]) & (spread < known * np.log(ASTRAY_M))
     cost = np.where(possible, worse - known * np.log(0.95), np.inf)
     np.fill_diagonal(cost, 0.0)
@@ -333,51 +339,52 @@ def _exchanged(view: RecordingView, fit: QuickFit) -> tuple[dict[int, int], Cand
 
 
 def places_m(view: RecordingView) -> dict[str, Floats]:
-    """Return the places (3,) of the bodies that carry tags and do not move, within what motion capture says of that."""
+    """Return the positions (3,) of the bodies that carry tags and do not move, within the noise of motion capture."""
     bodies = sorted({tag.body for tag in view.tags} & set(np.unique(view.poses.body).tolist()))
     points = {body: view.poses.position_m[view.poses.body == body] for body in bodies}
     return {body: np.median(some, axis=0) for body, some in points.items() if np.ptp(some, axis=0).max() < 0.02}
 
 
 def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
-    """Yield anchors whose ranges fit other places, tested by the slopes of all distances there together.
+    """Yield anchors whose ranges fit other places, with a joint test by the slopes of all distances there.
 
-    Where slopes at the given place may be zero no other is searched for: distances are linear in centimetres, not in
-    metres, so that a search cannot be spared. Slopes at the other place are those of the error model, because
-    reflections move a robust loss in directions that ranges hardly determine, as the height where robots keep theirs.
+    If slopes at the given place may be zero, no other place is searched for. Otherwise a search is needed: distances
+    are linear over centimetres, but not over metres. At the other place slopes are from the error model, because
+    reflections bias a robust loss in directions that ranges hardly determine, such as the height if robots stay at one
+    height.
     """
     places = places_m(view)
-    sides, poses, away = _sides(view, fit, places), view.poses, dict[str, Floats]()
+    sides, poses, away = _vectors_to_bodies(view, fit, places), view.poses, dict[str, Floats]()
     if not sides:
         return
-    for body, own in _apart(fit.test(_outward(sides)), sides).items():
+    for body, own in _by_body(fit.test(_decrease_by_motion(sides)), sides).items():
         mine = sides[body].any(axis=1)
-        # Where anchors are metres off, what power does is not known, and small beside that.
+        # If anchors are metres off, the effect of power is unknown, and small in comparison.
         far = robust_spread(fit.residual[mine]) > ASTRAY_M
-        # One of twenty right places costs time; the slopes at the other one are tested.
+        # One of twenty right places is searched, which costs time only; the slopes at the other place are tested.
         if far or _p_of_place(own, own.total) <= 0.05:
             error_m = (fit.error if far else fit.residual)[mine]
             starts = [place - places[body] for place in places.values()]
             away[body] = _place(sides[body][mine], error_m, fit.model.pairs.number[mine], starts)
             there_m = np.where(poses.body[:, None] == body, poses.position_m + away[body], poses.position_m)
             poses = replace(poses, position_m=there_m)
-    if not away or (moved := (told := _with_truth(view, poses=poses)).quick_fit) is None:
+    if not away or (moved := (changed := _with_truth(view, poses=poses)).quick_fit) is None:
         return
-    # What ranges know of the other places, as they fit these.
-    tested = moved.test_constants(_outward(_sides(told, moved, places)))
-    at_other = _apart(_beside_pairs(tested, len(moved.model.pairs.names)), sides)
-    before_m, after_m = (one.less_pairs(one.error_m)[fit.rows] for one in (view, told))
+    # Information of ranges on the other places, which they fit.
+    tested = moved.test_constants(_decrease_by_motion(_vectors_to_bodies(changed, moved, places)))
+    at_other = _by_body(_after_offsets_of_pairs(tested, len(moved.model.pairs.names)), sides)
+    before_m, after_m = (one.less_pairs(one.error_m)[fit.rows] for one in (view, changed))
     for body, there in away.items():
         own, mine = at_other[body], sides[body].any(axis=1)
-        # The last step is that of the fit, whose slopes are tested.
+        # The last step is from the fit whose slopes are tested.
         shift = there - _step(own)
-        size, gain = float(np.linalg.norm(shift)), _gain(before_m[mine], after_m[mine])
+        size, gain = float(np.linalg.norm(shift)), _common_decrease_m(before_m[mine], after_m[mine])
         before, after = (robust_spread(errors[mine]) for errors in (before_m, after_m))
         # The spread of all ranges, and half of it more.
         if size <= TOLERANCE_M or gain <= 0 or after >= 1.5 * robust_spread(after_m):
             continue
         axes, loose = _axes(own, shift)
-        # Places above each other are alike to robots that move in a plane; a displacement is known to a tenth.
+        # Robots that move in a plane cannot distinguish places above each other; a displacement is known to a tenth.
         others = " and ".join(
             name
             for name, place in places.items()
@@ -399,11 +406,11 @@ def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
         )
 
 
-def _sides(view: RecordingView, fit: QuickFit, bodies: Iterable[str]) -> dict[str, Floats]:
+def _vectors_to_bodies(view: RecordingView, fit: QuickFit, bodies: Iterable[str]) -> dict[str, Floats]:
     """Return the vectors (n, 3) to bodies from the antennas at the other ends of ranges, zero for ranges of others.
 
-    Bodies with fewer than 200 ranges are left out: in 32 stretches of time slopes would be of some ranges each, and far
-    from normal.
+    Bodies with fewer than 200 ranges are left out: in 32 stretches of time each slope would be a sum over few ranges,
+    and far from normal.
     """
     e, found = view.exchanges[fit.rows], dict[str, Floats]()
     here, there = (antennas_m(view.poses, view.tags, ids, e.time_ns) for ids in (e.initiator, e.target))
@@ -414,27 +421,31 @@ def _sides(view: RecordingView, fit: QuickFit, bodies: Iterable[str]) -> dict[st
     return found
 
 
-def _outward(sides: dict[str, Floats]) -> Floats:
-    """Return by how much ranges (n, 3 * bodies) shrink as bodies move along the axes; `sides` (n, 3) lead to them."""
+def _decrease_by_motion(sides: dict[str, Floats]) -> Floats:
+    """Return the decrease of ranges (n, 3 * bodies) by motion of bodies along the axes; `sides` (n, 3) point to the
+    bodies.
+    """
     return np.hstack([side / np.maximum(np.linalg.norm(side, axis=1), 1e-9)[:, None] for side in sides.values()])
 
 
-def _apart(tested: Tested, bodies: Iterable[str]) -> dict[str, Tested]:
-    """Return the slopes by displacements of each body, beside those of the others."""
+def _by_body(tested: Tested, bodies: Iterable[str]) -> dict[str, Tested]:
+    """Return the slopes by displacements of each body, with the displacements of the others fitted."""
     axes = np.arange(len(tested.total)) // 3
     return {
-        body: tested.beside(np.flatnonzero(axes != k).tolist()).turned(np.eye(len(axes))[axes == k])
+        body: tested.with_fitted(np.flatnonzero(axes != k).tolist()).combined(np.eye(len(axes))[axes == k])
         for k, body in enumerate(bodies)
     }
 
 
-def _beside_pairs(tested: Tested, pairs: int) -> Tested:
-    """Return slopes by what comes after offsets of pairs, where each pair has an offset of its own, about `PAIR_M`."""
+def _after_offsets_of_pairs(tested: Tested, pairs: int) -> Tested:
+    """Return the slopes after the first `pairs` ones, which are offsets of pairs with a standard deviation
+    of `PAIR_M`.
+    """
     own = tested.information[:pairs, :pairs]
     taken = -np.linalg.solve(own + np.eye(pairs) / PAIR_M**2, tested.information[:pairs, pairs:])
     step = np.hstack([taken.T, np.eye(len(tested.total) - pairs)])
-    found, left = tested.turned(step), step @ tested.information
-    # Offsets of pairs are in the slopes as well, as far as they are not taken off.
+    found, left = tested.combined(step), step @ tested.information
+    # Slopes also contain the part of the offsets of pairs that was not subtracted.
     offsets = PAIR_M * left[:, :pairs]
     return replace(found, information=left[:, pairs:], covariance=found.covariance + offsets @ offsets.T)
 
@@ -448,28 +459,29 @@ def _p_of_place(tested: Tested, slope: Floats) -> float:
 
 
 def beside_places(view: RecordingView, fit: QuickFit, pairs: Sequence[int]) -> tuple[Tested, list[Candidate]]:
-    """Return the slopes by offsets of all pairs beside places of anchors, and these places beside offsets of `pairs`.
+    """Return the slopes by offsets of all pairs with places of anchors fitted, and by these places with offsets of
+    `pairs` fitted.
 
-    Places that ranges contradict whatever the offsets of these pairs are one candidate, as anchors that range with each
-    other tell how they stand together, and hardly which one is elsewhere.
+    Places that ranges contradict for any offsets of these pairs are one candidate: anchors that range with each other
+    determine their relative positions, but hardly which of them is displaced.
     """
     count, places = len(fit.model.pairs.names), places_m(view)
-    sides = _sides(view, fit, places) if view.posed and view.standing_m is None else {}
-    tested = fit.test_constants(_outward(sides) if sides else None)
-    offsets = tested.beside(range(count, len(tested.total))).turned(np.eye(count, len(tested.total)))
+    sides = _vectors_to_bodies(view, fit, places) if view.posed and view.standing_m is None else {}
+    tested = fit.test_constants(_decrease_by_motion(sides) if sides else None)
+    offsets = tested.with_fitted(range(count, len(tested.total))).combined(np.eye(count, len(tested.total)))
     if not sides:
         return offsets, []
-    together = _beside_pairs(tested.beside(pairs), count)
-    each, said, lines = _apart(together, sides), list[str](), list[str]()
-    # Those that are off wherever the others stand, or else all.
+    together = _after_offsets_of_pairs(tested.with_fitted(pairs), count)
+    each, away, lines = _by_body(together, sides), list[str](), list[str]()
+    # The anchors that are displaced for any positions of the others, or otherwise all.
     alone = [body for body, own in each.items() if _p_of_place(own, own.total) < BUDGET] or [*sides]
     for body in alone:
         shift = -_step(each[body])
-        said.append(f"{body} {_axes(each[body], shift)[0]}")
+        away.append(f"{body} {_axes(each[body], shift)[0]}")
         lines += [_line(view, tag, shift) for tag in view.tags if tag.body == body]
     seen = Candidate(
         "places that do not close",
-        f"ranges contradict the positions of {', '.join(sides)} together; the best displacements are {'; '.join(said)}",
+        f"ranges contradict the positions of {', '.join(sides)} together; the best displacements are {'; '.join(away)}",
         _p_of_place(together, together.total),
         {"lines": "".join(lines)},
     )
@@ -477,15 +489,17 @@ def beside_places(view: RecordingView, fit: QuickFit, pairs: Sequence[int]) -> t
 
 
 def _step(own: Tested) -> Floats:
-    """Return the displacement (3,) that slopes ask for; without ranges a place is known to half a metre.
+    """Return the displacement (3,) by slopes; the prior of a place has a standard deviation of half a metre.
 
-    So much a tape misread or a tripod moved does. Where slopes know nothing, there is no displacement.
+    A misread tape or a moved tripod has such an effect. Without information there is no displacement.
     """
     return np.asarray(np.linalg.solve(own.information + np.eye(3) / (LOOSEST * 0.5) ** 2, own.total))
 
 
 def _axes(own: Tested, shift: Floats) -> tuple[str, str]:
-    """Return a displacement (3,) with intervals of 95 %, and the axes that ranges hardly tell from delays, in words."""
+    """Return a displacement (3,) with intervals of 95 %, and the axes that ranges hardly separate from delays, in
+    words.
+    """
     inverse = np.linalg.pinv(own.information, rcond=1e-12, hermitian=True)
     times = special.stdtrit(min(own.lasting.freedom, own.blocks - 3.0), 0.975)
     wide = times * np.sqrt(np.diag(inverse @ own.covariance @ inverse))
@@ -504,8 +518,8 @@ def _place(apart: Floats, error: Floats, pair: Ints, starts: Sequence[Floats]) -
 def _best(away_m: Callable[[Floats], Floats], measured_m: Floats, pair: Ints, starts: Sequence[Floats]) -> Floats:
     """Return the unknowns (3,) of distances `away_m` (n,) by robust least squares, beside a constant of each pair.
 
-    The better of searches from zero and from the best of some starts (3,). A thousandth of a range holds unknowns at
-    zero where ranges do not: robots that move in a plane do not see the height of an anchor.
+    The better of searches from zero and from the best of several starts (3,). A prior with the weight of a thousandth
+    of a range determines the other directions: robots that move in a plane do not determine the height.
     """
     pair = np.unique(pair, return_inverse=True)[1]
 

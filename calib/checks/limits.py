@@ -1,4 +1,4 @@
-"""Limits of a fit: what its data do not determine, and values that are physically impossible.
+"""Limits of a fit: combinations that its data do not determine, and values that are physically impossible.
 
 Impossible data are refused; doubtful data get a warning.
 """
@@ -27,21 +27,21 @@ from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import names_in
 
 WITHOUT_CURVE: Final = "delays only"
-"""How warnings of fits without a curve begin."""
+"""First words of warnings of fits without a curve."""
 
 LOUD_M: Final = 0.5
-"""Errors that spread by more are not those of a UWB range: noise is 3 to 10 cm, and mean detours of published flights
-are 0.1 to 0.5 m (MILUV, STAR-loc)."""
+"""Maximum spread of errors of UWB ranges: noise is 3 to 10 cm, and mean detours of published flights are 0.1 to 0.5 m
+(MILUV, STAR-loc)."""
 
 REGISTER_NS: Final = 65_536 * TICK_S * 1e9
-"""Antenna delays are registers of 16 bits, in ticks: up to 1.03 us, twice what a board has that is programmed with none
-(514 ns). A delay beyond is a length in the wrong unit: 154 m of range a tag."""
+"""Antenna delays are registers of 16 bits, in ticks: up to 1.03 us, twice the delay of an unprogrammed board (514 ns).
+A larger delay is a length in the wrong unit: 154 m of range per tag."""
 
 
 def limit_warnings(
     found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Mapping[int, float]
 ) -> Iterator[str]:
-    """Yield sentences about what the data do not determine; `residuals_m` (n,) are fully corrected errors."""
+    """Yield sentences about undetermined values; `residuals_m` (n,) are fully corrected errors."""
     model, pairs, count = found.model, found.model.settings.constants == "pair", len(found.model.pairs.ends)
     bare = int(np.count_nonzero(ranges.protocol == NO_STAMPS))
     unread = any(is_single_sided(name) and not corrected(name) for name in names_in(ranges.protocol))
@@ -96,7 +96,7 @@ def _without_curve(found: KnownDistances, ranges: Ranges, residuals_m: Floats) -
 
 
 def _mean_dbm(ranges: Ranges) -> Floats:
-    """Return the mean powers of the ranges that have any (k,)."""
+    """Return the mean powers (k,) of the ranges with powers."""
     both = np.column_stack([ranges.fpp1_dbm, ranges.fpp2_dbm])
     return np.asarray(np.nanmean(both[np.isfinite(both).any(axis=1)], axis=1))
 
@@ -120,13 +120,13 @@ def _impossible(ranges: Ranges) -> Iterator[str]:
     sessions = np.unique(ranges.session)
     if len(ranges) > 1 and not any(np.ptp(ranges.time_ns[ranges.session == number]) for number in sessions):
         yield "all ranges have the same time, so the persistence of errors cannot be estimated; give their times"
-    # How ranges and true distances spread: a unit or two columns may be wrong.
+    # Spreads of ranges and true distances: a unit or two columns may be wrong.
     if fault := growth_fault("ranges", ranges.raw_m, ranges.truth_m):
         yield f"{fault}; give both in metres"
-    # Clock ratios that no crystals have: stamps that wrapped, or columns in the wrong order.
+    # Clock ratios that are impossible for crystals: wrapped stamps, or columns in the wrong order.
     weight = ranges.weight_target[ranges.protocol == "ds"]
     skew = 1e6 * float(np.median(np.abs(2 * weight - 1))) if len(weight) else 0.0
-    # Crystals of these boards keep 20 ppm each, over temperature and age.
+    # Crystals of these boards are within 20 ppm, over temperature and age.
     if skew > 100.0:
         yield (
             f"clocks differ by {skew:.0f} ppm according to third messages, but crystals by at most 40 ppm; the third "
@@ -137,11 +137,11 @@ def _impossible(ranges: Ranges) -> Iterator[str]:
 def initiator_warning(ranges: Ranges) -> Iterator[str]:
     """Return a sentence about the pair whose ranges depend most on the initiator, a sign of uncorrected clock skew.
 
-    Medians of raw errors show it also where a fit takes such ranges for reflections.
+    Medians of raw errors show it even if a fit takes such ranges for reflections.
     """
     ways = _medians_by_way(ranges.raw_m - ranges.truth_m, ranges)
-    # Standard errors are those of independent ranges. In the simulator's room, errors that last make variances of sums
-    # up to 15 times as large, so that eight of them are two, and more is no chance.
+    # Standard errors are for independent ranges. In the simulator's room, errors that last make variances of sums up to
+    # 15 times as large, so eight of these standard errors are about two, and more is not by chance.
     differ_m = {
         (a, b): middle - ways[b, a][0]
         for (a, b), (middle, std) in ways.items()
@@ -157,7 +157,7 @@ def initiator_warning(ranges: Ranges) -> Iterator[str]:
 
 
 def _medians_by_way(values: Floats, ranges: Ranges) -> dict[tuple[int, int], tuple[float, float]]:
-    """Return the median of values (n,) by (initiator, target), with its standard error, of 20 finite ones at least."""
+    """Return the median of at least 20 finite values (n,) by (initiator, target), with its standard error."""
     known = np.isfinite(values)
     link, number, count = np.unique(
         (ranges.initiator * 65_536 + ranges.target)[known], return_inverse=True, return_counts=True
@@ -170,13 +170,13 @@ def _medians_by_way(values: Floats, ranges: Ranges) -> dict[tuple[int, int], tup
 def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: Ranges) -> None:
     """Raise `UnanswerableError` if a fit found impossible values, so that its calibration is useless.
 
-    Delays beyond what registers hold, and errors as large as the ranges are: then true distances say nothing of the
-    ranges, as they do in another unit where bodies move so little that how ranges grow with them is not seen.
+    Impossible are delays beyond the registers, and errors as large as the ranges: then true distances are unrelated to
+    the ranges, or in another unit and nearly constant, so that their scale is not visible.
     """
     typical = float(np.median(np.abs(ranges.raw_m)))
     largest = max(map(abs, delays_ns.values()), default=0.0)
     spread = robust_spread(residuals_m)
-    # No UWB radio measures a kilometre, and then true distances may be in that unit, too.
+    # No UWB radio measures a kilometre; then true distances may be in that unit, too.
     if largest < REGISTER_NS and spread < max(typical, LOUD_M) and (typical < 1000.0 or spread < LOUD_M):
         return
     ratio = typical / max(float(np.median(np.abs(ranges.truth_m))), 1e-9)
@@ -190,8 +190,8 @@ def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: 
 
 
 LEAST_INLIERS: Final = 0.5
-"""Share of ranges within three sigmas of a fit that can be believed; of direct ranges 99.7 % are. Where more than half
-are reflected, delays rest on the fewer ones; places that were made up leave 0 to 34 % (swarm broadcasts)."""
+"""Minimum share of ranges within three sigmas of a credible fit; for direct ranges it is 99.7 %. If more than half are
+reflected, delays depend on the minority; invented places leave 0 to 34 % (swarm broadcasts)."""
 
 
 def refuse_contradicted(inliers: float, ranges: Ranges, findings: Sequence[str]) -> None:
@@ -207,7 +207,7 @@ def refuse_contradicted(inliers: float, ranges: Ranges, findings: Sequence[str])
 def implausible_values(delays_ns: Mapping[int, float], residuals_m: Floats) -> Iterator[str]:
     """Yield sentences about fitted values that are implausible for hardware."""
     spread, worst = robust_spread(residuals_m), max(delays_ns, key=lambda tag: abs(delays_ns[tag]), default=-1)
-    # Boards of one kind differ by less than 2.5 ns: four times what published ones differ by (0.6 ns).
+    # Boards of one kind differ by less than 2.5 ns: four times the difference of published delays (0.6 ns).
     if abs(delays_ns.get(worst, 0.0)) > 2.5:
         yield (
             f"tag {worst}: the delay of {delays_ns[worst]:+.1f} ns is larger than differences of boards (2.5 ns); "
@@ -248,15 +248,15 @@ def warnings_of(ranges: Ranges, inliers: float, seconds: float) -> Iterator[str]
 
 
 SAME_LEVEL_DB: Final = 0.5
-"""Levels of tags that differ by less are taken for the same; medians of a pair's ranges are known to a tenth of it."""
+"""Smaller differences of levels of tags are ignored; medians of a pair's ranges are known to a tenth of this."""
 
 
 def power_level_warning(ranges: Ranges, calibration: Calibration) -> Iterator[str]:
     """Return a sentence about tags whose powers differ from the others so much that their delays may contain an error.
 
-    At the ends of a link a frame and its answer take the same way, so what differs is the tags' own: how strongly one
-    sends and how high it reads. Only the sum is seen. A tag that reads powers too high has its ranges corrected as
-    stronger ones are, and its delay takes what that is on average: right for its ranges, not for its antenna.
+    A frame and its answer take the same path, so a difference of their powers is due to the tags: transmit power and
+    error of readings. Only the sum is visible. If a tag reads powers too high, its ranges get the correction of
+    stronger ones, and its delay absorbs the mean of this difference: right for its ranges, wrong for its antenna.
     """
     levels = power_levels_db(ranges)
     if not levels:
@@ -267,7 +267,7 @@ def power_level_warning(ranges: Ranges, calibration: Calibration) -> Iterator[st
         tag: level
         for tag, (level, std) in levels.items()
         if half_ns[tag] > 0
-        # Readings of one place come together, so that standard errors are a little small.
+        # Readings at one place follow each other, so standard errors are slightly too small.
         and abs(level) > max(SAME_LEVEL_DB, 4.0 * std)
         and abs(level) * each_ns > max(half_ns[tag], SMALLEST_NS)
     }
@@ -284,9 +284,9 @@ def power_level_warning(ranges: Ranges, calibration: Calibration) -> Iterator[st
 def power_levels_db(ranges: Ranges) -> dict[int, tuple[float, float]]:
     """Return the excess of powers that each tag measures minus the excess that it transmits, relative to most others.
 
-    In dB, each with its standard error; tags of which no pair has enough ranges with both powers are left out.
+    In dB, each with its standard error; tags without a pair that has enough ranges with both powers are left out.
     """
-    # The initiator reads what the target sent, and the target what the initiator sent.
+    # The initiator reads the target's frame, and the target the initiator's.
     ways = _medians_by_way(ranges.fpp2_dbm - ranges.fpp1_dbm, ranges)
     if not ways:
         return {}
@@ -309,5 +309,5 @@ def _ns_a_decibel(ranges: Ranges, calibration: Calibration) -> float:
     ]
     known = np.all(np.isfinite(lifted), axis=0)
     at, first, second = (float(np.mean(calibration.bias_curve(power[known]))) for power in lifted)
-    # A range has half of either end's delay.
+    # A range contains half of the delay of each end.
     return abs(0.5 * (first + second) - at) / (0.5 * SPEED_OF_LIGHT) * 1e9

@@ -1,11 +1,11 @@
 """Errors that depend on places: errors that all ranges between the same two bodies share, whichever of their tags
 range.
 
-A wall, a partition or a thing nearby lengthens all ranges between two bodies together, for as long as they are where
-they are. Part of it comes and goes as bodies move, and shows as residuals of different pairs of tags that go together.
-Part of it stays for the whole flight, and delays take up what they can of that. What they cannot shows where there are
-more pairs of bodies than bodies; where there are not, what stays is taken to be about as large as what comes and goes.
-Trajectories that are estimated from ranges absorb both; reflections of different pairs then still come together.
+A wall, a partition or an object lengthens all ranges between two bodies together, for as long as they stay in place.
+One part varies as bodies move: it correlates residuals of different pairs of tags. The other part is constant for the
+whole flight, and delays absorb some of it. The remainder is visible if there are more pairs of bodies than bodies;
+otherwise the constant part is assumed to be about as large as the varying one. Trajectories that are estimated from
+ranges absorb both; then reflections of different pairs still occur at the same times.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 
 WIDENING_DEVIATION, CERTAIN_DEVIATION = 2.3, 3.1
-"""Deviations that no more than 1 % and 0.1 % of sound flights show: the first widens intervals, the second is said."""
+"""Deviations that at most 1 % and 0.1 % of sound flights have: the first widens intervals, the second is reported."""
 
 
 INFORMATION_LEFT = 0.03
-"""Share of an offset's information that delays must leave: of less, slopes say nothing of its size."""
+"""Minimum share of an offset's information that delays leave: with less, slopes do not determine its size."""
 
 SIZES_M = np.geomspace(3e-4, 0.2, 60)
-"""Standard deviations of offsets that are thought of; an offset of more is a detour, and among reflections."""
+"""Possible standard deviations of offsets; a larger offset is a detour, and counts as a reflection."""
 
 
 def place_covariance(
@@ -37,7 +37,7 @@ def place_covariance(
     """Return the covariance (tags, tags) that place-dependent errors add to that of the delays, and a sentence if they
     matter.
 
-    `pairs` are the slopes of offsets by pair, `before_ns2` is the covariance without places. Nothing is found where no
+    `pairs` are the slopes of offsets by pair, `before_ns2` is the covariance without places. Nothing is found if no
     body is known to carry two tags.
     """
     nothing = np.zeros_like(before_ns2), list[str]()
@@ -45,28 +45,28 @@ def place_covariance(
     if group is None:
         return nothing
     sums = np.eye(int(group.max()) + 1)[:, group]
-    values, reach = _staying(pairs, sums)
-    variance, deviation = _moving(found, slopes, sums)
-    # How surely something stays, as deviations of one normal value.
+    values, reach = _constant_part(pairs, sums)
+    variance, deviation = _varying_part(found, slopes, sums)
+    # The significance of the constant part, as a deviation of one normal value.
     stays = -float(special.ndtri(special.chdtrc(max(len(values), 1), float(values @ values))))
-    together = _reflected_together(found, group)
+    together = _simultaneous_reflections(found, group)
     certain = max(deviation, stays) > CERTAIN_DEVIATION
     if max(deviation, stays, together) <= WIDENING_DEVIATION:
         return nothing
     spread = 1 + reach[:, None] * SIZES_M**2
     likely = -0.5 * np.sum(np.log(spread) + values[:, None] ** 2 / spread, axis=0)
-    # A partition or two that are always in between add 2 cm, to a factor of e.
+    # A partition or two that are always in between add 2 cm, within a factor of e.
     middle, width = 0.02, 1.0
     if deviation > WIDENING_DEVIATION:
-        # What stays is as large as what comes and goes, to 0.8 logarithms (a factor of 2.2, a judgement): in rooms of
-        # the simulator it was 1.2 to 4 times as large, in smooth fields of errors a sixth to two thirds.
+        # The constant part is as large as the varying one, within 0.8 logarithms (a factor of 2.2, a judgement): in
+        # rooms of the simulator it was 1.2 to 4 times as large, in smooth fields of errors a sixth to two thirds.
         middle, width = np.sqrt(variance), 0.8
     elif stays <= WIDENING_DEVIATION:
         # Trajectories followed reflections by 0.4 to 1.9 cm (three flights in a hall of metal, six of tests).
         middle, width = 0.01, 0.8
-    effects = _as_one(likely - 0.5 * (np.log(SIZES_M / middle) / width) ** 2) * pairs.effects @ sums.T
+    effects = _deviation_of_mixture(likely - 0.5 * (np.log(SIZES_M / middle) / width) ** 2) * pairs.effects @ sums.T
     widening = effects @ effects.T
-    # What all delays have in common hangs on the curve as well, and is less known by far.
+    # The common part of all delays also depends on the curve, and is far less certain.
     apart = np.eye(len(before_ns2)) - 1 / max(len(before_ns2), 1)
     own, more = (np.diag(apart @ one @ apart) for one in (before_ns2, widening))
     if max(deviation, stays, together) <= CERTAIN_DEVIATION or not np.any(more > np.maximum(own, SMALLEST_NS**2)):
@@ -84,15 +84,15 @@ def place_covariance(
     ]
 
 
-def _as_one(likely: Floats) -> float:
-    """Return the standard deviation whose 95 % interval is that of all sizes together, by their log likelihoods."""
+def _deviation_of_mixture(likely: Floats) -> float:
+    """Return the standard deviation with the 95 % interval of the mixture of all sizes, by their log likelihoods."""
     weight = np.exp(likely - likely.max())
     within = 2 * special.ndtr(TWO_SIDED_95 * SIZES_M[:, None] / SIZES_M) - 1
     return float(np.interp(0.95, within @ (weight / weight.sum()), SIZES_M))
 
 
 def _pairs_of_bodies(found: KnownDistances) -> Ints | None:
-    """Return the number of the two bodies of each pair (pairs,); None where no two pairs are of the same ones."""
+    """Return the number of the two bodies of each pair (pairs,); None if no two pairs have the same bodies."""
     carried = dict(found.model.ranges.bodies)
     if found.model.settings.constants == "pair" or not carried:
         return None
@@ -101,11 +101,12 @@ def _pairs_of_bodies(found: KnownDistances) -> Ints | None:
     return np.array([groups.index(both) for both in ends]) if len(groups) < len(ends) else None
 
 
-def _staying(pairs: Tested, sums: Floats) -> tuple[Floats, Floats]:
-    """Return what delays leave of offsets that all pairs of a group have (k,), of unit variance were there no offset.
+def _constant_part(pairs: Tested, sums: Floats) -> tuple[Floats, Floats]:
+    """Return the parts (k,) of offsets of groups of pairs that delays do not absorb, with unit variance without
+    offsets.
 
-    With it (k,) by how much the variance of each grows with that of offsets, in 1/m^2; `sums` (groups, pairs) says
-    whose pairs are.
+    Also returns the derivative (k,) of their variances by the variance of offsets, in 1/m^2; `sums` (groups, pairs)
+    maps pairs to groups.
     """
     total, information = sums @ pairs.total, sums @ pairs.information @ sums.T
     values, vectors = np.linalg.eigh(information)
@@ -120,19 +121,20 @@ def _staying(pairs: Tested, sums: Floats) -> tuple[Floats, Floats]:
     return np.clip(turned.T @ root.T @ total, -largest, largest), reach
 
 
-def _moving(found: KnownDistances, slopes: Slopes, sums: Floats) -> tuple[float, float]:
-    """Return the variance of errors that pairs of a group share while they last, and its deviation from none.
+def _varying_part(found: KnownDistances, slopes: Slopes, sums: Floats) -> tuple[float, float]:
+    """Return the variance of varying errors that pairs of a group share, and its deviation from zero in standard
+    errors.
 
-    Of the slopes that different pairs of a group have in the same second, products are summed: noise, and reflections
-    that belong to a pair, leave nothing of them on average.
+    Products of slopes of different pairs of a group in the same second are summed: noise, and reflections of single
+    pairs, contribute zero on average.
     """
     pair, second = found.model.pairs.number[slopes.order], _seconds(found.blocks)
     count, size = int(second[-1]) + 1, sums.shape[1]
     where = second[slopes.order] * size + pair
     slope, known = (
-        np.bincount(where, values, count * size).reshape(count, size) for values in (slopes.score, slopes.tells)
+        np.bincount(where, values, count * size).reshape(count, size) for values in (slopes.score, slopes.information)
     )
-    # Of a robust loss, a pair of which most ranges lie far out may know less than nothing.
+    # With a robust loss, a pair with mostly large errors may have negative information.
     whole = known.sum(axis=0)
     some = whole > INFORMATION_LEFT * whole.max()
     slope, known, sums = slope[:, some], known[:, some], sums[:, some]
@@ -150,11 +152,12 @@ def _seconds(blocks: TimeBlocks) -> Ints:
     return np.asarray(blocks.number // each)
 
 
-def _reflected_together(found: KnownDistances, group: Ints) -> float:
-    """Return how surely reflections of different pairs of a group (pairs,) come together, in standard deviations.
+def _simultaneous_reflections(found: KnownDistances, group: Ints) -> float:
+    """Return the significance of simultaneous reflections of different pairs of a group (pairs,), in standard
+    deviations.
 
-    Estimated trajectories follow an error that all ranges between two bodies have, which then leaves no residuals. The
-    ranges that look reflected still come together. The value is 0 where distances are known.
+    Estimated trajectories absorb a common error of all ranges between two bodies, which then leaves no residuals.
+    Reflected ranges still occur at the same times. The value is 0 where distances are known.
     """
     fitted, pair = found.searches[-1], found.model.pairs.number
     if fitted.rows.geometry is None:
@@ -165,14 +168,14 @@ def _reflected_together(found: KnownDistances, group: Ints) -> float:
         values - (np.bincount(pair, values) / count)[pair]
         for values in (looks.reflected, looks.reflected - looks.by["odds"])
     )
-    # Reflections weaken powers, and powers of all pairs change with distance: the weaker of what is seen with and
-    # without what power explains counts.
+    # Reflections reduce powers, and powers of all pairs change with distance: the smaller value of those with and
+    # without the part explained by power is used.
     explained = by_power * (by_power @ reflected) / max(float(by_power @ by_power), 1e-300)
-    return min(_together(values, second, pair, group) for values in (reflected, reflected - explained))
+    return min(_correlation_of_pairs(values, second, pair, group) for values in (reflected, reflected - explained))
 
 
-def _together(values: Floats, second: Ints, pair: Ints, group: Ints) -> float:
-    """Return by how many standard deviations sums of values (n,) by second go together in pairs of a group.
+def _correlation_of_pairs(values: Floats, second: Ints, pair: Ints, group: Ints) -> float:
+    """Return the correlation of sums of values (n,) by second between pairs of a group, in standard deviations.
 
     Products of two pairs are compared with those of the same two at every other lag (circular shifts), so that each
     may persist.

@@ -1,7 +1,8 @@
-"""A recording as checks see it, and a quick robust fit of it whose residuals are tested for one more unknown.
+"""A recording in the form that checks use, and a quick robust fit whose residuals are tested for one more unknown.
 
-Of a long recording stretches over all of its time are examined: shares, medians and what lasts show in some hundred
-thousand exchanges. Stretches are taken, and not single exchanges, because errors that last show in neighbours only.
+Of a long recording, stretches over its whole time are examined: some hundred thousand exchanges are enough for shares,
+medians and errors that last. Stretches are used instead of single exchanges, because only neighbours show errors that
+last.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from scipy import sparse
 
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import RecordedSource, Source
-from calib.estimator.known_distances import FEWEST_RANGES, PILOT, Fitted, likeliest, model_of, robust_fit
+from calib.estimator.known_distances import FEWEST_RANGES, PILOT, Fitted, fit_likelihood, model_of, robust_fit
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import METRES_A_NS, RangeModel
 from calib.estimator.range_rows import RESIDUAL, Part, RangeRows, Robust
@@ -38,7 +39,8 @@ from uwblink.twr import Exchanges
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingView:
-    """A recording as the checks see it: its exchanges, each once, and their `ranges`, with NaN for unknown truth.
+    """A recording in the form that checks use: its exchanges, each once, and their `ranges`, with NaN for unknown
+    truth.
 
     `reported_twice` exchanges were reported by both ends, and `contradictions` are the differences of such reports;
     `doubled` rows repeated another one. A recording is `posed` if true distances come from poses, and `standing` if it
@@ -69,7 +71,7 @@ class RecordingView:
     def standing_m(self) -> float | None:
         """The largest change of a pair's distance if none changes by more than 10 cm, else None.
 
-        Those are two wavelengths, over which power hardly varies.
+        This is two wavelengths, over which power hardly varies.
         """
         good = np.isfinite(self.ranges.truth_m)
         pair, truth_m = pairs_of(self.ranges.initiator, self.ranges.target).number[good], self.ranges.truth_m[good]
@@ -78,7 +80,7 @@ class RecordingView:
 
     @property
     def error_m(self) -> Floats:
-        """Range less truth, shape (n,)."""
+        """Range minus truth, shape (n,)."""
         return self.ranges.raw_m - self.ranges.truth_m
 
     def chosen(self, rows: Bools | Ints) -> RecordingView:
@@ -86,7 +88,7 @@ class RecordingView:
         return replace(self, exchanges=self.exchanges[rows], ranges=self.ranges[rows])
 
     def less_pairs(self, error_m: Floats) -> Floats:
-        """Return errors (n,) less the median of their pair, NaN for pairs with ten or fewer."""
+        """Return errors (n,) minus the median of their pair, NaN for pairs with ten or fewer."""
         good = np.isfinite(error_m)
         pair = pairs_of(self.ranges.initiator[good], self.ranges.target[good]).number
         left = np.full(len(error_m), np.nan)
@@ -95,15 +97,15 @@ class RecordingView:
 
 
 def view_of(name: str, source: Source) -> RecordingView:
-    """Return a source as the checks see it: each exchange once, with its range and its true distance."""
-    looked = looked_at(source)
-    again = repeated_rows(looked.exchanges)
-    both = looked.exchanges[~again]
+    """Return a source in the form that checks use: each exchange once, with its range and its true distance."""
+    part = select_part(source)
+    again = repeated_rows(part.exchanges)
+    both = part.exchanges[~again]
     reports = single_reports(both)
     e = reports.exchanges
     truth_m, posed = e.truth_m, False
-    if len(looked.poses):
-        by_poses = distances_m(looked.poses, looked.tags, e.initiator, e.target, e.time_ns)
+    if len(part.poses):
+        by_poses = distances_m(part.poses, part.tags, e.initiator, e.target, e.time_ns)
         given = np.isfinite(truth_m)
         # Tables with places of antennas have both, which are then equal.
         apart = np.abs(truth_m - by_poses)[given & np.isfinite(by_poses)]
@@ -115,28 +117,28 @@ def view_of(name: str, source: Source) -> RecordingView:
         name=name,
         exchanges=e,
         ranges=ranges,
-        poses=looked.poses,
-        tags=list(looked.tags),
-        faults=list(getattr(looked, "faults", ())),
+        poses=part.poses,
+        tags=list(part.tags),
+        faults=list(getattr(part, "faults", ())),
         reported_twice=reports.repeated,
         contradictions=[", ".join(differences(both, a, b)) for a, b in reports.differing.tolist()],
         doubled=int(np.count_nonzero(again)),
         posed=posed,
         differences=getattr(source, "differences", None) or {},
         warming=frozenset((getattr(source, "temperature", None) or {"tag": np.zeros(0)})["tag"].tolist()),
-        standing=bool(getattr(source, "arrangements", ())) and not len(looked.poses) and not np.isfinite(truth_m).any(),
+        standing=bool(getattr(source, "arrangements", ())) and not len(part.poses) and not np.isfinite(truth_m).any(),
     )
 
 
 EXAMINED_EXCHANGES: Final = 160_000
-"""Exchanges of a recording that are looked at: four training flights' worth."""
+"""Number of exchanges of a recording that are examined: four training flights."""
 
 EXAMINED_STRETCHES: Final = 40
-"""Stretches of time, evenly spread over a long recording, in which these are: 20 s each at 200 exchanges a second,
-twice as long as errors last in the worlds of `make worlds`."""
+"""Number of stretches of time with these exchanges, evenly spread over a long recording: 20 s each at 200 exchanges per
+second, twice the duration of errors in the worlds of `make worlds`."""
 
 
-def looked_at(source: Source) -> Source:
+def select_part(source: Source) -> Source:
     """Return the part of a source to examine: all of it, or stretches of the exchanges of a long recording."""
     if not isinstance(source, RecordedSource) or source.recording.count("exchanges") <= EXAMINED_EXCHANGES:
         return source
@@ -161,8 +163,8 @@ def examined_part(count: int) -> str:
 class QuickFit:
     """A robust fit to the ranges (n,) of all pairs with enough of them, by session and time.
 
-    `rows` (n,) are those of each recording, `error` (n,) is measured less true, metres. `start` is the robust fit of a
-    sample, with the scale of the loss, and `x` (p,) are the unknowns of all.
+    `rows` (n,) are the rows of the recordings, `error` (n,) is measured minus true, metres. `start` is the robust fit
+    of a sample, with the scale of the loss, and `x` (p,) are the unknowns of all.
     """
 
     rows: Ints
@@ -201,21 +203,22 @@ class QuickFit:
 
     @cached_property
     def residual(self) -> Floats:
-        """Measured less fitted (n,), metres."""
+        """Measured minus fitted (n,), metres."""
         return self.ranges.residuals(self.x)
 
     @cached_property
     def blocks(self) -> TimeBlocks:
-        """Short blocks of time, of which the sums of scores are made up."""
+        """Short blocks of time for sums of scores."""
         return time_blocks(self.model.ranges.time_ns, self.model.ranges.session)
 
     @cached_property
     def slopes(self) -> Slopes:
-        """Slopes that test for more unknowns, with the curvature of the loss, which standard errors need."""
+        """Slopes for tests of more unknowns, with the curvature of the loss, which standard errors need."""
         ranges = replace(self.ranges, errors=replace(cast("Robust", self.start.rows.errors), least=None))
-        # Long blocks in the place of short ones: sums over them hardly share errors that last.
+        # Long blocks instead of short ones: errors that last hardly correlate sums over them.
         short = self.blocks
-        # Variances of 32 sums are known to a quarter, and errors that last for a hundredth of the recording are in one.
+        # Variances of 32 sums are known to a quarter, and errors that last for a hundredth of the recording are within
+        # one block.
         count = min(32, short.count)
         number = short.number.astype(np.int64) * count // short.count
         bounds = np.unique(np.append(short.bounds[:-1] * count // short.count, count))
@@ -223,23 +226,24 @@ class QuickFit:
 
     @cached_property
     def reflected(self) -> Floats:
-        """The probability (n,) that each range is reflected, by the likeliest error model beside all else."""
+        """The probability (n,) that each range is reflected, by the likeliest error model."""
         return self.likeliest.rows.error_slopes(self.likeliest.optimum.x, ()).reflected
 
     @cached_property
     def likeliest(self) -> Fitted:
         """The fit by the error model of ranges."""
-        return likeliest(self.model, self.error, self.start)
+        return fit_likelihood(self.model, self.error, self.start)
 
     def test(self, derivative: Floats | sparse.csr_matrix) -> Tested:
-        """Return the slopes of the residuals by offsets, of which each range has some (n, k)."""
+        """Return the slopes of the residuals by offsets with derivatives (n, k) of ranges."""
         return self.slopes.test(Family(kind="", names=(), derivative=sparse.csr_matrix(derivative)))
 
     def test_constants(self, more: Floats | None = None) -> Tested:
-        """Return the slopes by an offset of each pair, and by `more` (n, k), in metres, beside the delays of all tags.
+        """Return the slopes by an offset of each pair, and by `more` (n, k), in metres, with the delays of all tags
+        fitted.
 
-        The fit has a constant of each pair, which is what all of these would make of it. It is that by the error model,
-        because a third of a pair's ranges that is reflected moves a robust mean by centimetres.
+        The fit has a constant of each pair, which contains all of these. It is fitted by the error model, because a
+        robust mean moves by centimetres if a third of a pair's ranges is reflected.
         """
         optimum, pairs, tags = self.likeliest.optimum, self.model.pairs, self.model.tags
         derivative = (
@@ -254,16 +258,16 @@ class QuickFit:
         ends[: len(fitted)] = np.equal.outer(pairs.ends, tags).sum(axis=1)
         taken = found.information @ ends
         left = np.eye(len(ends)) - taken @ np.linalg.pinv(ends.T @ taken, rcond=1e-9, hermitian=True) @ ends.T
-        return replace(found, total=found.total + metres).turned(left)
+        return replace(found, total=found.total + metres).combined(left)
 
     def offset(
         self, course: Floats, pairs: Floats | None = None, *, tolerance: float = 0.0, tried: int = 1
     ) -> tuple[float, float, QuickFit]:
-        """Return an offset of pairs (k,), or of all, in a course (n,), its p-value, and a fit to ranges without it.
+        """Return an offset of pairs (k,), or of all, with a course (n,), its p-value, and a fit to ranges without it.
 
-        The p-value is that of an offset of the tolerance at most, one of so many that were `tried`. Slopes at no offset
-        say too little of a large one, so it is fitted; what it leaves in residuals is no noise, so its standard error
-        is that of the fit without it.
+        The p-value is for an offset within the tolerance, after `tried` trials. Slopes at zero are not enough for a
+        large offset, so it is fitted; its remainder in residuals is not noise, so its standard error is from the fit
+        without it.
         """
         pairs = np.ones(len(self.model.pairs.names)) if pairs is None else pairs
         derivative = pairs[self.model.pairs.number] * course
@@ -281,7 +285,8 @@ class QuickFit:
         rest = QuickFit.of(self.model, self.error - size * derivative, self.rows, self.start, x[:-1])
         tested = rest.test(sparse.csr_matrix(self.by_pair.multiply(course[:, None])))
         known, alone = float(pairs @ tested.information @ pairs), np.diag(tested.covariance) * pairs
-        # Errors of different pairs hardly go together, so that each tells of their variance (Welch and Satterthwaite).
+        # Errors of different pairs hardly correlate, so each pair contributes to their variance (Welch and
+        # Satterthwaite).
         variance = max(float(pairs @ tested.covariance @ pairs), float(alone.sum()))
         std = float(np.sqrt(variance)) / known if known > REACHED * tested.whole else np.inf
         freedom = min(tested.lasting.freedom, tested.blocks - 1.0) * alone.sum() ** 2 / max(np.sum(alone**2), 1e-300)
@@ -299,8 +304,8 @@ def quick_fit(views: Sequence[RecordingView], constants: str = "pair", ranges_a_
     ranges = concatenate([view.ranges[rows] for view, rows in zip(views, kept, strict=True)])
     model = model_of(ranges, FitSettings(constants=constants), trimmed=False)
     error, kinds = model.ranges.raw_m - model.ranges.truth_m, ("delay", *model.curve_kinds())
-    # Convex, so that offsets of any size are found by steps from none; its slope is bounded, so that reflections weigh
-    # little more than other ranges.
+    # Convex, so that steps from zero find offsets of any size; its slope is bounded, so that reflections have little
+    # more weight than other ranges.
     start = robust_fit(model, error, "soft_l1", None, kinds, sample=PILOT)
     return QuickFit.of(model, error, np.concatenate(kept), start, start.optimum.x)
 

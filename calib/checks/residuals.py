@@ -26,20 +26,20 @@ from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import intervals, without_stamps
 
 ONE_WAY_M: Final = 0.05
-"""By how much ranges of a sound pair may differ by who initiates: the powers of both ways are not quite alike, and
-published curves slope by 2 cm a dB (rms over -98 to -78 dBm)."""
+"""Maximum difference of the ranges of a sound pair between its two initiators: the powers of both directions differ
+slightly, and published curves have a slope of 2 cm per dB (rms over -98 to -78 dBm)."""
 
 MANY_SHARE: Final = 0.15
 """Share of reflected ranges of a sound recording: among obstacles placed for it a MILUV flight has 12 %."""
 
 LEAST_SHARE: Final = 0.02
-"""With a smaller share of reflected ranges, it is not asked how long reflections last: it is a sixth of what a MILUV
-flight has, and noise passes for it."""
+"""With a smaller share of reflected ranges, the duration of reflections is not tested: it is a sixth of the share in a
+MILUV flight, and noise can be taken for it."""
 
 LASTING_S, AGAIN = 0.8, 0.35
-"""A reflection that lasts longer is named, if a range after a reflected one is likelier reflected than others by more
-than this share of what is left. Antennas turn by less than their beams are wide within it, in sound recordings too: set
-by seeds below those of `benchmarks.flights.FIRST_REPORTED`."""
+"""Longer reflections are named if the probability of a reflection after a reflected range exceeds the mean by more than
+this share of the remainder to 1. Within this time antennas turn by less than the width of their beams, also in sound
+recordings: set with seeds below `benchmarks.flights.FIRST_REPORTED`."""
 
 LEFT, WRONG_SIGN = "skew in single-sided ranges", "carrier readings with the wrong sign"
 SLOPES: Final = {
@@ -67,10 +67,11 @@ def unrelated_ranges(view: RecordingView) -> Iterator[Candidate]:
     for pair, name in enumerate(fit.model.pairs.names):
         rest = np.minimum(np.abs(fit.residual[fit.model.pairs.number == pair]), 10 * ASTRAY_M)
         means = np.array([float(np.mean(rest[s])) for s in stretches(len(rest))])
-        # Logarithms have the mean's logarithm as their mean at most (Jensen), and vary less from stretch to stretch.
+        # The mean of logarithms is at most the logarithm of the mean (Jensen), and logarithms vary less between
+        # stretches.
         found.append((positive(np.log(np.maximum(means, 1e-3) / ASTRAY_M)), f"{name} by {np.mean(rest):.2f} m"))
     found.sort()
-    # What is wrong with an anchor or a tag is wrong with several pairs: of all p-values together (Simes 1986).
+    # A fault of an anchor or a tag affects several pairs: a joint test of all p-values (Simes 1986).
     p_value = min(len(found) * p_value / k for k, (p_value, _) in enumerate(found, 1))
     wrong = [name for own, name in found if own < BUDGET]
     more = f" and {len(wrong) - 6} pairs more" if wrong[6:] else ""
@@ -92,7 +93,7 @@ def skew(view: RecordingView) -> Iterator[Candidate]:
     if len(taken) != 1:
         return
     known = single & np.isfinite(e.skew2_ppm) & (e.skew2_ppm != 0)
-    # Delays are the same both ways, and do not follow skews, so that pairs that range one way tell of it as well.
+    # Delays are the same in both directions, and independent of skews, so pairs that range in one direction also count.
     fit = quick_fit([view.chosen(known)], constants="tag")
     if fit is None:
         yield from _by_direction(view.chosen(single))
@@ -171,7 +172,7 @@ def _detour_m(fit: QuickFit, long: Bools, mine: Bools | slice) -> float:
 
 
 def _of_pair(fit: QuickFit, pair: int, every: Bools) -> Iterator[Candidate]:
-    """Yield a pair whose reflected ranges follow each other, with how much they lengthen its ranges as its gain."""
+    """Yield a pair whose reflected ranges follow each other; its gain is their effect on its mean range."""
     mine = fit.model.pairs.number == pair
     long, share = every[mine], float(np.mean(every[mine]))
     if len(long) < 60 or not LEAST_SHARE < share < 1:
@@ -188,25 +189,25 @@ def _of_pair(fit: QuickFit, pair: int, every: Bools) -> Iterator[Candidate]:
 
 
 def _life_s(reflected: Floats, step_s: float) -> float:
-    """Return how long a reflection lasts on average, from probabilities (n,) that ranges of a pair are reflected.
+    """Return the mean duration of a reflection, from probabilities (n,) that ranges of a pair are reflected.
 
-    The autocorrelation of a process of two states falls exponentially with time, at the sum of both rates; what noise
-    hides it hides at all lags alike. Ranges are `step_s` apart.
+    The autocorrelation of a process of two states decreases exponentially with time, at the sum of both rates; noise
+    reduces it by the same factor at all lags. Ranges are `step_s` apart.
     """
     apart = reflected - reflected.mean()
     near, far = (float(np.mean(apart[lag:] * apart[:-lag])) for lag in (1, 4))
     if near <= 0:
         return 0.0
     rate = np.log(near / max(far, 0.01 * near)) / (3 * step_s)
-    # What lasts longer than a quarter of the recording cannot be told from another level.
+    # A change that lasts longer than a quarter of the recording cannot be distinguished from another level.
     return float(min(1 / max(rate * (1 - reflected.mean()), 1e-9), step_s * len(reflected) / 4))
 
 
 def closures(view: RecordingView) -> Iterator[Candidate]:
     """Find pairs with an offset that the delays of their tags do not explain; equivalent pairs are named as well.
 
-    The constants of pairs in a quick fit are what delays and offsets of pairs add up to. So offsets are found as those
-    of the score tests of a fit are, and of any size: what delays take of constants is linear.
+    The constants of pairs in a quick fit are sums of delays and offsets of pairs. So offsets of any size are found as
+    in the score tests of a fit: the part that delays absorb is linear.
     """
     # With ten ranges a pair's constant is known to 2 cm, half of the tolerance.
     fit = view.quick_fit or quick_fit([view], ranges_a_pair=10)
@@ -214,21 +215,21 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
         return
     tested, several = fit.test_constants(), len(fit.model.pairs.names)
     top = [fit.model.pairs.names.index(one.names[0]) for one in findings(tested, several, BUDGET, PAIR_M)]
-    # What offsets that are found leave of the others.
-    rest = tested.beside(top).total / np.maximum(np.diag(tested.information), 1e-300)
+    # The others, with the found offsets fitted.
+    rest = tested.with_fitted(top).total / np.maximum(np.diag(tested.information), 1e-300)
     spread_m = robust_spread(rest, 0.0)
-    # Where reflections make all pairs differ, one of them has to stand out among these.
-    # Biases by power of two pairs may differ by 0.2 m (published curves), where the pairs share no power.
+    # If reflections make all pairs differ, a faulty pair must be significant among these. Biases over power of two
+    # pairs may differ by 0.2 m (published curves) if the pairs have no common powers.
     tolerance = max(PAIR_M, float(special.ndtri(1 - BUDGET / (2 * several))) * spread_m) + (
         0.2 if view.standing_m is not None else 0.0
     )
     found = list(findings(tested, several, BUDGET, tolerance))
     if not found:
         return
-    # Anchors at wrong places leave offsets of pairs as well, and these none beside places.
+    # Anchors at wrong places cause offsets of pairs, too; with places fitted, none remain.
     offsets, places = beside_places(view, fit, top)
     sure = {name for one in findings(offsets, several, BUDGET, tolerance) for name in one.names}
-    # That anything is wrong offsets of pairs say; the places' own value says only what it is.
+    # Offsets of pairs determine whether there is a fault; the places' own p-value determines only its kind.
     elsewhere = [replace(seen, p_value=found[0].p_value) for seen in places if seen.p_value < BUDGET]
     yield from elsewhere
     for one in found:
@@ -253,20 +254,20 @@ class Change:
     p_value: float
 
     def __str__(self) -> str:
-        """Return what it is in the tag's delay, and that it is the tag's."""
+        """Return the change of the tag's delay, in words."""
         return f"({2e9 * abs(self.size_m) / SPEED_OF_LIGHT:.2f} ns of its delay) in all its pairs, those of others"
 
 
 def changed_delays(view: RecordingView) -> Iterator[Candidate]:
     """Find tags whose delay changes during a recording, at once or steadily."""
     fit = view.quick_fit
-    # Of a shorter recording the 32 stretches of scores would last for less than errors do.
+    # In a shorter recording the 32 stretches of scores would be shorter than the duration of errors.
     if fit is None or fit.blocks.seconds < 10.0:
         return
     share = fit.blocks.number / fit.blocks.count
-    # No change is looked for within four of the stretches of time of scores at either end: sums over fewer are far from
-    # normal where reflections last, and their variance is not known. Times are so close that a step between two loses
-    # 1 % of its size; they are fewer for many pairs, for the sake of memory.
+    # No change is sought within four stretches of scores at either end: sums over fewer are far from normal if
+    # reflections last, and their variance is unknown. Times are so close that a step between two loses 1 % of its size;
+    # for many pairs there are fewer, to save memory.
     cuts = np.linspace(1 / 8, 7 / 8, min(47, 1500 // len(fit.model.pairs.ends)))
     courses = np.column_stack([share[:, None] >= cuts, share])
     by_readings = "fit the dependence on its measured temperature (setting `temperature`); or "
@@ -284,13 +285,14 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
 
 
 def changes_of_tags(fit: QuickFit, courses: Floats) -> Iterator[Change]:
-    """Yield changes of single tags, unless another change that is found says that it was no delay.
+    """Yield changes of single tags, unless another change shows that the delay did not change.
 
-    Such are one of a pair, or of all tags, at about that time, and one back: a body in the way goes again. An antenna,
-    or a voltage, is one tag's, so that other pairs change by 40 % of it at most (a judgement).
+    Such changes are one of a pair, or of all tags, at about the same time, and one back to the old value: an obstacle
+    that leaves again. An antenna or a voltage belongs to one tag, so other pairs change by at most 40 % of it (a
+    judgement).
     """
     named, found = set[int | None]({None}), _changes(fit, courses)
-    # Of two courses that share less than half of their variance neither stands for the other.
+    # Two courses that share less than half of their variance are different changes.
     same = np.atleast_2d(np.corrcoef(courses.T)) ** 2 > 0.5
     for one in found:
         against = [
@@ -300,18 +302,20 @@ def changes_of_tags(fit: QuickFit, courses: Floats) -> Iterator[Change]:
             or (two.tag == one.tag and two.size_m * one.size_m < 0)
         ]
         alone = all(abs(two.size_m) <= 0.4 * abs(one.size_m) for two in against)
-        # No antenna and no voltage does more than 5 ns.
+        # No antenna and no voltage changes a delay by more than 5 ns.
         if one.tag not in named and alone and abs(one.size_m) < 0.75:
             named.add(one.tag)
             yield one
 
 
 def _changes(fit: QuickFit, courses: Floats) -> list[Change]:
-    """Return changes in one of the courses (n, k), each beside those before it: of all tags, of one, or of a pair."""
+    """Return changes with one of the courses (n, k), each with the previous ones fitted: of all tags, of one, or of a
+    pair.
+    """
     pairs, width, tags = len(fit.model.pairs.ends), courses.shape[1], np.unique(fit.model.pairs.ends).tolist()
     own = np.equal.outer(tags, fit.model.pairs.ends).any(axis=2).astype(float)
     several = own.sum(axis=1)
-    # A tag with one pair needs others, for the pair to be its own matter.
+    # A tag with only one pair is included if there are other pairs; otherwise the pair explains its change.
     kept = np.flatnonzero((several < pairs) & ((several > 1) | (pairs - several > 2)))
     whose, found = [None, *(tags[k] for k in kept), *[None] * pairs], list[Change]()
     groups = np.vstack([np.ones(pairs), own[kept], np.eye(pairs)])
@@ -324,13 +328,14 @@ def _changes(fit: QuickFit, courses: Floats) -> list[Change]:
         )
         known = np.where(known > REACHED * tested.whole, known, np.inf)
         gain = (groups @ tested.total.reshape(width, pairs).T) ** 2 / known
-        # By how much variances exceed those of slopes that are a likelihood's, for most changes.
+        # The usual ratio of variances to those of the slopes of a likelihood.
         excess = float(np.median((variance / known)[np.isfinite(known)])) if np.isfinite(known).any() else np.inf
-        # Of these standard errors; a finding needs five of its own, which may be smaller.
+        # In these standard errors; a finding needs five of its own, which may be smaller.
         likely = [k for k in np.argsort(-gain.max(axis=1))[:4].tolist() if gain[k].max() > 3**2 * excess]
         for k in likely:
             course = int(np.argmax(gain[k]))
-            # What temperature does to the delay of a sound board: 2.15 mm a degree (DW1000 user manual), ten degrees.
+            # The effect of temperature on the delay of a sound board: 2.15 mm per degree (DW1000 user manual), ten
+            # degrees.
             size, p_value, rest = fit.offset(courses[:, course], groups[k], tolerance=0.02, tried=len(tags) * width)
             if p_value < BUDGET:
                 found, fit = [*found, Change(tag=whose[k], course=course, size_m=size, p_value=p_value)], rest
@@ -341,7 +346,7 @@ def _changes(fit: QuickFit, courses: Floats) -> list[Change]:
 
 
 def _by_pair(fit: QuickFit, courses: Floats) -> sparse.csr_matrix:
-    """Return courses (n, k) as those of each pair (n, k * pairs)."""
+    """Return courses (n, k) for each pair separately (n, k * pairs)."""
     return sparse.csr_matrix(sparse.hstack([fit.by_pair.multiply(course[:, None]) for course in courses.T]))
 
 
@@ -355,7 +360,7 @@ def between_recordings(views: Sequence[RecordingView], level: float) -> Iterator
         given, bodies = [places_m(view) for view in (first, second)], set().union(*both)
         for body in sorted(bodies.intersection(*given)):
             found = [of.get(body) for of in both]
-            # Where it stands in both, by its ranges.
+            # Its positions in both recordings, by its ranges.
             (away,) = np.diff(
                 [
                     places[body] + (one.words["away_m"] if one else 0.0)

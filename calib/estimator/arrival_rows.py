@@ -1,7 +1,8 @@
 """Differences of arrival as rows of a fit, beside the ranges of the same exchanges.
 
 Their errors do not correlate with those of the ranges (`calib.data.arrivals`). A range depends on half the sum of both
-delays, and a difference of arrival on half their difference: rows of both kinds know different things.
+delays, and a difference of arrival on half their difference: rows of both kinds determine different combinations of
+delays.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ OFFSET_OF_PATH, PATH_SIGNS = f"{HEARD}offset of path", np.array([-1.0, 1.0])
 
 @dataclass(frozen=True, kw_only=True)
 class ArrivalModel:
-    """Unknowns and parts of differences of arrival (n,); `residual` (n,) is with all unknowns zero, metres.
+    """Unknowns and parts of differences of arrival (n,); `residual` (n,) is in metres, for unknowns of zero.
 
-    `exchange` (n,) is the row of each one's range, `listener` (n,) a number among `listeners`, `targets` (n,) the tags
-    that respond, `path` (n, 2) the numbers among `paths` of those from initiator and target to the listener. Rows count
-    for a share 1/`design_effect` of as many independent ones.
+    `exchange` (n,) is the row of the range of each difference, `listener` (n,) a number among `listeners`, `targets`
+    (n,) the tags that respond, `path` (n, 2) the numbers among `paths` of those from initiator and target to the
+    listener. Each row has the weight 1/`design_effect` of an independent row.
     """
 
     residual: Floats
@@ -108,13 +109,13 @@ class ArrivalModel:
         used = [part for part in (*self.parts, *more) if part.kind in layout.where]
         return RangeRows.of(self.residual, self.key, used, errors, layout, exchange=self.exchange)
 
-    def weighed(self, own: Floats, of_ranges: Floats, pairs: Ints, blocks: TimeBlocks) -> ArrivalModel:
-        """Return the model with the weight of a difference of arrival beside a range.
+    def with_weight(self, own: Floats, of_ranges: Floats, pairs: Ints, blocks: TimeBlocks) -> ArrivalModel:
+        """Return the model with the weight of a difference of arrival relative to a range.
 
         `own` (n,) and `of_ranges` (m,) are slopes by residuals, `pairs` (m,) the numbers of the ranges' pairs. Sums of
-        slopes vary more than those of independent rows: by target, because listeners share receptions and hear a
-        reflection in every exchange while it lasts, more than by pair. Rows count for less by the ratio of both (Kish's
-        design effects).
+        slopes vary more than sums over independent rows. They vary more by target than by pair, because listeners share
+        receptions and receive a reflection in every exchange while it lasts. The weight of rows is divided by the ratio
+        of both (Kish's design effects).
         """
         target = np.unique(self.targets, return_inverse=True)[1]
         lasting = lasting_in_pairs(own, target, replace(blocks, number=blocks.number[self.exchange]))
@@ -122,7 +123,7 @@ class ArrivalModel:
 
 
 def _curve_parts(model: RangeModel, spline: SplineValues, arrivals: Arrivals, lifted: list[Floats]) -> Iterator[Part]:
-    """Yield the bias over power of three receptions, less that of the range: weights of all splines of each curve."""
+    """Yield the bias over power of three receptions minus the range's bias: weights of all splines of each curve."""
     ranges, row = model.ranges, arrivals.exchange
     i, j, k = ranges.initiator[row], ranges.target[row], arrivals.listener
     of_range = SplineValues(knots=spline.knots, values=spline.values[row], first=spline.first[row])

@@ -1,9 +1,10 @@
 """The one covariance, a sandwich: squared slopes summed by block of time, between inverse information matrices.
 
-Errors that share a cause (a reflection, a pose) come in stretches, and a sum of many blocks then varies more than
-independent blocks would. How much more is read off the variances of sums over 1, 2, 4 ... blocks, all components
-pooled, and fitted with an autocorrelation a rho^h (`persistence`). What the fit itself used of the data is given back
-(HC1 of MacKinnon and White 1985, for a penalised fit), and what priors may pull is added (Wahba 1983; Nychka 1988).
+Errors that share a cause (a reflection, a pose) last for some time, so a sum of many blocks varies more than a sum of
+independent blocks. The ratio is estimated from the variances of sums over 1, 2, 4 ... blocks, all components pooled,
+and fitted with an autocorrelation a rho^h (`persistence`). The covariance is corrected for the degrees of freedom that
+the fit used (HC1 of MacKinnon and White 1985, for a penalised fit), and the bias by priors is added (Wahba 1983; Nychka
+1988).
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ have four coefficients. Half or twice as many move no delay (`python -m benchmar
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kept:
-    """Unknowns (k,) whose errors have one persistence, estimated from `combinations` (m, k) of which so many are
-    independent."""
+    """Unknowns (k,) whose errors have one persistence, estimated from `combinations` (m, k) with this number of
+    independent ones."""
 
     indices: Ints
     combinations: Floats
@@ -40,17 +41,18 @@ class Kept:
 
     @classmethod
     def delays(cls, indices: Ints, each: float, held: Floats) -> Kept:
-        """Return delays; pairs have so many ranges `each`, `held` (k, m) are directions that ranges do not determine.
+        """Return delays; `each` is the number of ranges per pair, `held` (k, m) are directions that ranges do not
+        determine.
 
         Their common part is the constant of the curve and is excluded from the persistence, unless ranges determine
-        nothing else, as those of one pair. The parameters of a pair's errors are known from its own ranges, so
-        intervals are those of Student's t with as many degrees of freedom as a pair has ranges beyond one.
+        only this part (as with one pair). The parameters of a pair's errors are known from its own ranges, so intervals
+        are those of Student's t with as many degrees of freedom as a pair has ranges beyond one.
         """
         count = len(indices)
-        told = np.eye(count) - (held @ np.linalg.pinv(held) if held.size and count else 0.0)
-        apart = told - told.sum(axis=0) / max(count, 1)
+        determined = np.eye(count) - (held @ np.linalg.pinv(held) if held.size and count else 0.0)
+        apart = determined - determined.sum(axis=0) / max(count, 1)
         # Clock skews leave some 1e-5 of a difference that ranges of one pair do not determine.
-        apart = apart if np.linalg.norm(apart) > 1e-3 else told
+        apart = apart if np.linalg.norm(apart) > 1e-3 else determined
         return cls(indices=indices, combinations=apart, independent=max(count - 1, 1), freedom=max(each - 1, 2.0))
 
     @classmethod
@@ -59,9 +61,9 @@ class Kept:
         return cls(indices=indices, combinations=np.eye(len(indices)), independent=CURVE_SERIES)
 
     def beside(self, indices: Ints) -> Kept:
-        """Return these unknowns and others after them, of which there are too few to tell how long their errors last.
+        """Return these unknowns and others after them, which are too few to estimate how long their errors last.
 
-        The errors of ranges of the same pairs are behind both.
+        Errors of ranges of the same pairs cause the errors of both.
         """
         whole = block_diag(self.combinations, np.eye(len(indices)))
         return replace(self, indices=np.append(self.indices, indices), combinations=whole)
@@ -72,8 +74,8 @@ def sandwich(
 ) -> dict[str, tuple[Floats, Persistence]]:
     """Return the covariance (k, k) of each group of kept unknowns by its name, and the persistence of its errors.
 
-    1.96 standard errors make 95 % intervals: the factor of small samples is included. The standard errors of rows
-    `beside` ranges (poses, tapes) are taken as stated.
+    1.96 standard errors make 95 % intervals: the factor of small samples is included. For rows `beside` ranges (poses,
+    tapes) the stated standard errors are used.
     """
     optimum, count, found = slopes.optimum, slopes.count, {}
     information, stated = optimum.information, optimum.priors.precision()
@@ -96,7 +98,7 @@ def sandwich(
 
 
 def of_weights(optimum: Optimum, keep: Ints) -> Floats:
-    """Return the covariance (k, k) that uncertain weights of priors add to that of some unknowns (k,).
+    """Return the covariance (k, k) that uncertain weights of priors add to the covariance of some unknowns (k,).
 
     A change of the logarithm of a weight moves the unknowns by covariance times precision times their distance from the
     prior's centre. The variance of that logarithm is 2 over the degrees of freedom of the prior, as for the variance of
@@ -115,8 +117,8 @@ def of_weights(optimum: Optimum, keep: Ints) -> Floats:
 
 
 def of_few_draws(optimum: Optimum, keep: Ints) -> Floats:
-    """Return the covariance (k, k) by which that of some unknowns (k,) is wider, because few values tell the variance
-    of a prior: its part of the covariance is that of Student's t instead of a normal distribution."""
+    """Return the covariance (k, k) that is added to the covariance of some unknowns (k,), because few values determine
+    the variance of a prior: its part of the covariance is scaled from a normal distribution to Student's t."""
     found, priors, reach = np.zeros((len(keep),) * 2), optimum.priors, optimum.covariance[:, keep]
     for (where, prior), weight, structure in zip(priors.all, priors.weights, priors.structures, strict=True):
         width = float(stdtrit(prior.freedom, 0.975)) / TWO_SIDED_95

@@ -1,9 +1,9 @@
-"""Delays of antennas over direction and temperature as unknowns: what both ends of a range have of a covariate.
+"""Delays of antennas over direction and temperature as unknowns: sums over both ends of a range.
 
-A dependence is shared by all tags, or each has its own. Of directions two bodies have a part of their own beside it,
-and two tags: these belong to places (a wall that a robot sees whenever it heads north), and are fitted so that they do
-not pass for the antennas'. All are draws about zero whose standard deviations are estimated, as those of offsets of
-pairs are; those of temperature are draws about a common slope, of which the manual of the DW1000 knows something.
+All tags share a dependence, or each tag has its own. For directions, each pair of bodies and each pair of tags has a
+further dependence. These are effects of places (a wall that is in front of a robot whenever it heads north); they are
+fitted so that they are not taken for antennas. All have the mean zero and an estimated standard deviation, like offsets
+of pairs. Slopes over temperature vary around a common slope; its prior is from the manual of the DW1000.
 """
 
 from __future__ import annotations
@@ -24,35 +24,37 @@ COMMON, OWN, OF_BODIES, OF_PAIR = "pattern", "pattern of tag", "pattern of bodie
 """Kinds of unknowns: of all antennas, of one, of two bodies, and of a pair of tags."""
 
 WARMTH, OWN_WARMTH = "temperature", "temperature of tag"
-"""Kinds of unknowns, m/K: by how much ranges grow with the temperature of either end, and what a tag adds to that."""
+"""Kinds of unknowns, m/K: the common slope of ranges over the temperature of either end, and its deviation
+for a tag.
+"""
 
 SPREAD_M = (0.02, 1e-4, 0.3)
-"""Standard deviation of factors of harmonics: start, and bounds between which it is estimated, m. Published antennas
-have patterns of up to 0.25 m."""
+"""Standard deviation of coefficients of harmonics: start, and bounds of the estimate, m. Published antennas have
+patterns of up to 0.25 m."""
 
 PRIORS = {
     **dict.fromkeys((COMMON, OWN), Prior.of_spread(*SPREAD_M)),
-    # A smaller start, so that what belongs to places does not take a pattern at once.
+    # A smaller start, so that effects of places do not absorb a pattern in the first steps.
     **dict.fromkeys((OF_BODIES, OF_PAIR), Prior.of_spread(0.005, *SPREAD_M[1:])),
     # The mean of the DW1000 user manual (8.3.1), which gives no spread. Users see up to 2 cm/K (lps-node-firmware 56):
     # 95 % of this prior lie between -1.6 and 2 cm/K.
     WARMTH: Prior.of_deviation(0.0091, 0.00215),
     OWN_WARMTH: Prior.of_spread(0.001, 1e-5, 0.02),
 }
-"""What is known of factors of harmonics (m) and of slopes (m/K) before anything is measured."""
+"""Priors of coefficients of harmonics (m) and of slopes (m/K)."""
 
 LEAST_SQUARE = 0.2
-"""Mean square of a harmonic over the fitted directions from which it is fitted, of 1 over all directions. A judgement:
-in a hall where it was 0.09 and less, factors of 6 cm made another flight worse by 5 cm."""
+"""Minimum mean square of a harmonic over the fitted directions for which it is fitted; over all directions it is 1. A
+judgement: in a hall where it was 0.09 and less, coefficients of 6 cm made another flight worse by 5 cm."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Covariate:
-    """Values of a covariate less their `centre` (k,) at both ends of ranges, `lower` first (the smaller id), (n, k).
+    """Values of a covariate minus their `centre` (k,) at both ends of ranges, `lower` first (the smaller id), (n, k).
 
-    They are 0 where they are not known, and for directions at tags whose bodies do not turn; `tags` are those that have
-    others, and `bodies` are those that carry tags; `square` (k, k) is the mean product of two values there, and `span`
-    (2, k) are the least and the largest.
+    Unknown values are 0, and so are directions at tags whose bodies do not turn; `tags` are the tags with other values,
+    `bodies` the bodies of tags; `square` (k, k) is the mean product of two values of these tags, and `span` (2, k) are
+    the smallest and the largest.
     """
 
     tags: tuple[int, ...]
@@ -85,11 +87,11 @@ class Covariate:
         if len(known):
             centre, span = known.mean(axis=0), np.array([known.min(axis=0), known.max(axis=0)])
             known -= centre
-            # In a flight on one level, what goes with elevation stays unknown, and is not extrapolated.
+            # In a flight at one height, the dependence on elevation is not determined, and is not extrapolated.
             known[:, np.einsum("nk,nk->k", known, known) < least_square * len(known)] = 0.0
             values[some] = known
         square = known.T @ known / max(len(known), 1)
-        # Of millions of ranges these are gigabytes.
+        # For millions of ranges these arrays have gigabytes.
         del known
         first = np.where(ranges.initiator < ranges.target, 0, 1)
         lower, higher = (values[np.arange(len(ranges)), side] for side in (first, 1 - first))
@@ -97,7 +99,7 @@ class Covariate:
         return cls(tags=tags, centre=centre, lower=lower, higher=higher, square=square, span=span, bodies=bodies)
 
     def entries(self, kind: str, pairs: Pairs) -> tuple[tuple[str, ...], Ints, Floats]:
-        """Return the names of the unknowns of a kind, and of each range the columns and values (n, m) that it has."""
+        """Return the names of the unknowns of a kind, and the columns and values (n, m) of each range."""
         each, count = np.arange(len(self.centre)), len(self.lower)
         if kind in (COMMON, WARMTH):
             return tuple(map(str, each)), np.broadcast_to(each, (count, len(each))), self.lower + self.higher
@@ -109,12 +111,14 @@ class Covariate:
         return tuple(f"{name} {k}" for name in names for k in each), columns[pairs.number], values
 
     def apart_from_places(self, pairs: Pairs) -> bool:
-        """Return whether bodies see more than two others each: with fewer, places can do all that own patterns do."""
+        """Return whether each body ranges with more than two others: with fewer, effects of places can replace own
+        patterns.
+        """
         bodies = {self.bodies.get(tag, str(tag)) for tag in self.tags}
         return len(self.entries(OF_BODIES, pairs)[0]) > 2 * len(self.centre) * len(bodies)
 
     def _owner(self, kind: str, tag: int, pair: list[int]) -> tuple[int | str, ...]:
-        """Return whose unknowns of a kind a tag has in a pair, () where it has no value."""
+        """Return the owner of the unknowns of a kind that a tag has in a pair, () if it has no value."""
         if tag not in self.tags:
             return ()
         body, *both = (self.bodies.get(one, f"tag {one}") for one in (tag, *pair))
@@ -134,7 +138,8 @@ COVARIATES: dict[str, tuple[Callable[[Ranges], Covariate], dict[str, tuple[str, 
     "temperature": (Covariate.of_temperatures, {"shared": (WARMTH,), "tag": (WARMTH, OWN_WARMTH)}),
     "pattern": (Covariate.of_directions, {"shared": (COMMON, *OF_PLACES), "tag": (OWN, *OF_PLACES)}),
 }
-"""What delays depend on by setting, and the kinds of unknowns by its value.
+"""Covariates by setting, and the kinds of unknowns by the value of the setting.
 
-Temperatures come first: a drift could pass for a pattern, and no pattern, which turns with the robot, for a drift.
+Temperatures come first: a drift could be taken for a pattern, but a pattern, which turns with the robot, is not taken
+for a drift.
 """

@@ -1,8 +1,8 @@
-"""The parameters of the error model as unknowns: levels that all ranges share, and what ranges deviate from them by.
+"""The parameters of the error model as unknowns: levels that all ranges share, and deviations of groups.
 
-Deviations belong to groups: the pairs of a fit, or whatever errors are compared by, as bins of power and listeners
-(`fit_grouped_errors`). The log odds of a reflection also follow features of receptions (`ReflectionFeatures`), whose
-slopes are fitted beside all else: no range is labelled as reflected beforehand, its likelihood is.
+Groups are the pairs of a fit, or other groups such as bins of power or listeners (`fit_grouped_errors`). The log odds
+of a reflection also depend on features of receptions (`ReflectionFeatures`), whose slopes are fitted with all other
+unknowns: no range is labelled as reflected beforehand.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ SHARED_LEVELS = {
 """Kind of the unknown that all ranges share, centre and standard deviation of its prior, by parameter."""
 
 STARTS = {"detour": np.log(1.0), "least": np.log(0.01), "long": 2.0}
-"""Where searches begin other than at the centres of priors: with detours that are longer than most, and none that is
-short. From these values 21 flights of six simulated rooms and six kinds of drawn errors ended where the likelihood was
-best or near it; from the centres some ended where it was less by 50 to 900, with long reflections taken for outliers.
+"""Start values of searches that differ from the centres of priors: detours longer than most, and no short detour. From
+these values 21 flights of six simulated rooms and six kinds of drawn errors ended at or near the best likelihood; from
+the centres some ended with a log likelihood lower by 50 to 900, with long reflections taken for outliers.
 """
 
 SCATTER = {"noise": (0.1, 0.01, 2.0), "odds": (0.7, 0.03, 2.0), "detour": (0.2, 0.03, 0.7)}
-"""Standard deviation of groups about these: its first value and bounds between which evidence finds it.
+"""Standard deviation of groups about these: start value, and bounds of the estimate.
 
 Half or twice of all of these moves delays of worlds by 0.11 standard errors (`python -m benchmarks.constants`).
 """
@@ -58,7 +58,7 @@ Half or twice of all of these moves delays of worlds by 0.11 standard errors (`p
 def error_unknowns(
     spread_m: float, names: tuple[str, ...], group: Ints, whose: str = "pair"
 ) -> tuple[list[Unknown], list[Part]]:
-    """Return the parameters of the error model, and the parts that ranges have in them.
+    """Return the parameters of the error model as unknowns, and the parts of ranges that depend on them.
 
     `group` (n,) is the number of each range's group among `names`, `spread_m` a first guess of the noise.
     """
@@ -92,15 +92,16 @@ def scattered(
 
 UNIT_OF_PRIOR = np.array([3.0, 2.0])
 """Changes of `FEATURES` (dB, taps) by which the odds of a reflection may change by a factor of e: the standard
-deviation of the prior of a slope is 1 for each. A judgement; makers of chips take 6 dB for a sign of a reflection
-(APS006, part 3), two of these."""
+deviation of the prior of a slope is 1 for each. A judgement; the chip maker regards 6 dB as a sign of a reflection
+(APS006, part 3), which is two of these changes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReflectionFeatures:
     """The features of ranges that vary, by `number` among `FEATURES` (k,): in `values` (n, k + 1) units from `centre`.
 
-    They are 0 where one is unknown; the last column is 1 where all are. `bounds` (2, k) are the least and the largest.
+    Unknown features are 0; the last column is 1 if all features are known. `bounds` (2, k) are the least and the
+    largest.
     """
 
     number: list[int]
@@ -132,8 +133,8 @@ class ReflectionFeatures:
     def state(self, stated: ErrorModel, slopes: Floats, share: Floats) -> ErrorModel:
         """Return an error model with the features whose `slopes` (k + 1,) were fitted.
 
-        `share` (n,) are the shares of reflections by the model without them, with features at their centre. The model's
-        shares become those of ranges of which no feature is known, with the same mean over all ranges.
+        `share` (n,) are the shares of reflections by the model without features, for features at their centre. The new
+        model's shares hold for ranges without known features, with the same mean over all ranges.
         """
         base, mean = logit(share), float(np.mean(expit(logit(share) + self.values @ slopes)))
         shift = float(brentq(lambda more: np.mean(expit(base + more)) - mean, -50.0, 50.0))
@@ -166,7 +167,7 @@ def fit_grouped_errors(groups: Sequence[Floats], most: int = 20_000) -> GroupedE
     `most`.
 
     The density is that of `calib.range_errors.densities`. Each group has a centre and a noise; shares and detours of
-    groups scatter about common values, as those of pairs do in a fit (`error_unknowns`).
+    groups vary around common values, as for pairs in a fit (`error_unknowns`).
     """
     members = [own[:: -(-len(own) // most)] for own in groups]
     count, size = len(members), np.array([len(own) for own in members])
@@ -175,7 +176,7 @@ def fit_grouped_errors(groups: Sequence[Floats], most: int = 20_000) -> GroupedE
     spread = np.maximum([robust_spread(own) for own in members], 1e-6)
     names = tuple(map(str, range(count)))
     unknowns, parts = error_unknowns(float(np.median(spread)), names, group, "group")
-    # Groups need not be alike in their noise: each has its own, about no common level.
+    # Each group has its own noise, without a common level.
     unknowns = [unknown for unknown in unknowns if not unknown.kind.startswith("noise")]
     parts = [part for part in parts if part.kind != "noise level"]
     log_spread = np.log(spread)

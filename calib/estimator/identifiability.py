@@ -15,7 +15,7 @@ from uwblink.arrays import Floats
 UNDETERMINED: Final = 1e-8
 """Smallest share of the largest eigenvalue at which a direction counts as determined.
 
-Clock ratios differ from 1 by parts per million, which lifts a free direction to 1e-12 at most.
+Clock ratios differ from 1 by parts per million, so eigenvalues of undetermined directions are 1e-12 at most.
 """
 
 
@@ -34,7 +34,7 @@ def free_directions(tags: list[int], ranges: Ranges) -> tuple[Floats, list[Split
     place = (rows % len(ranges), np.searchsorted(tags, ends[rows]))
     design = sparse.csr_array((weights[rows], place), shape=(len(ranges), len(tags)))
     if ranges.arrivals is not None:
-        # A difference of arrival has the delay of the target alone.
+        # A difference of arrival depends only on the delay of the target.
         heard = np.intersect1d(ranges.target[ranges.arrivals.exchange], tags)
         alone = sparse.csr_array(
             (np.ones(len(heard)), (np.arange(len(heard)), np.searchsorted(tags, heard))), shape=(len(heard), len(tags))

@@ -1,7 +1,7 @@
 """Inverses of information matrices: dense for few unknowns, by a sparse factorisation for many.
 
-Flights have thousands of unknowns, each of which shares rows with few others. Products with vectors, some columns, a
-block of the diagonal and traces are written the same for both.
+Flights have thousands of unknowns, each of which shares rows with few others. Both have the same operations: products
+with vectors, some columns, a block of the diagonal, traces.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ MOST_DENSE = 400
 """Unknowns up to which matrices are dense: a dense factorisation takes as long as a sparse one of a flight there."""
 
 HELD = 1e-13
-"""Share of its own information that each unknown has besides: it holds what neither rows nor priors determine, and is
-some hundred times the rounding of numbers."""
+"""Share of its own information that is added to each unknown: it makes combinations determinate that neither rows nor
+priors determine, and is some hundred times the rounding error."""
 
 PROBES = 24
-"""Random vectors by which traces of large products are estimated (Hutchinson 1990). The relative error is the root of
-2 over their number times that of unknowns: 3 % for a hundred unknowns."""
+"""Random vectors by which traces of large products are estimated (Hutchinson 1990). The relative error is the root of 2
+over their number times the number of unknowns: 3 % for a hundred unknowns."""
 
 Matrix = Floats | sparse.csc_matrix
 
@@ -98,7 +98,8 @@ def diagonal_of(matrix: sparse.csr_matrix, inverse: Inverse) -> Floats:
 def trace_of_product(inverse: Inverse, matrix: Matrix, where: slice = slice(None)) -> float:
     """Return the trace of the block `where` of an inverse times a symmetric matrix (k, k), estimated for a sparse one.
 
-    For an information matrix that is how many unknowns the rows determine, for a prior how many it does.
+    For an information matrix this is the number of unknowns that the rows determine, for a prior the number that it
+    determines.
     """
     if isinstance(inverse, SparseInverse):
         probes = np.zeros((inverse.shape[0], PROBES))

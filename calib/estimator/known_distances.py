@@ -51,8 +51,8 @@ ROBUST_LOSS = "cauchy"
 SCALE_OF_SPREAD = 0.5
 """Scale of a robust loss over the robust spread of the residuals.
 
-Half the spread keeps the optimum with the core when a tenth of the data has a positive tail, and still leaves a Cauchy
-loss two thirds of least squares' efficiency on clean data.
+With half the spread the optimum stays at the core if a tenth of the data has a positive tail, and a Cauchy loss has two
+thirds of the efficiency of least squares on clean data.
 """
 
 LEAST_SCALE_M, LARGEST_SPREAD_M = 0.0005, 3.0
@@ -80,7 +80,7 @@ class Fitted:
     beside: tuple[Rows, ...] = ()
 
     def slopes(self, blocks: TimeBlocks) -> list[Slopes]:
-        """Return the slopes of ranges and of differences of arrival, each with those of both by block of time."""
+        """Return the slopes of ranges and of differences of arrival, each with the sums of both by block of time."""
         kinds = [(self.rows, blocks)]
         if self.heard is not None and self.arrivals is not None:
             kinds.append((self.heard, replace(blocks, number=blocks.number[self.arrivals.exchange])))
@@ -93,13 +93,13 @@ class Fitted:
 
 @dataclass(frozen=True, kw_only=True)
 class KnownDistances:
-    """A fit to known distances: its `model`, the search that ended it, and the covariances of what was fitted.
+    """A fit to known distances: its `model`, the search that ended it, and the covariances of the fitted values.
 
-    `values` are unknowns by kind, `covariances` those of "delay", of all curves side by side ("curve"), of the noise
-    ("noise"), of patterns over direction ("pattern") and of delays and slopes over temperature ("temperature").
-    `residuals` (n,) are fitted less true ranges in the order of the model's ranges, metres. `searches` are the one
-    search, or that of the delays and that of the curves. `persistence` is that of errors of delays, and `slopes` and
-    `slopes_of_heard` are those of the first search.
+    `values` are unknowns by kind, `covariances` the covariances of "delay", of all curves together ("curve"), of the
+    noise ("noise"), of patterns over direction ("pattern") and of delays and slopes over temperature ("temperature").
+    `residuals` (n,) are fitted minus true ranges in the order of the model's ranges, metres. `searches` are the only
+    search, or the searches for delays and for curves. `persistence` is the persistence of errors of delays; `slopes`
+    and `slopes_of_heard` are from the first search.
     """
 
     model: RangeModel
@@ -119,12 +119,12 @@ class KnownDistances:
 
     @property
     def success(self) -> bool:
-        """Return whether every search settled."""
+        """Return whether every search converged."""
         return all(search.optimum.success for search in self.searches)
 
     @property
     def steps(self) -> int:
-        """Return how many steps all searches took."""
+        """Return the number of steps of all searches."""
         return sum(search.steps for search in self.searches)
 
 
@@ -144,7 +144,7 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances
     loss = settings.loss or (ROBUST_LOSS if settings.sequential or settings.delays_only else MIXTURE)
     scale_m = None if settings.scale_ns is None else settings.scale_ns * METRES_A_NS
     if settings.sequential and model.curve is not None and not model.pinned:
-        return _in_sequence(model, error, loss, scale_m, blocks)
+        return _fit_in_sequence(model, error, loss, scale_m, blocks)
     robust, heard = loss if loss != MIXTURE else ROBUST_LOSS, ArrivalModel.of(model)
     first = ("delay", *model.curve_kinds(), COMMON, OWN, WARMTH, OWN_WARMTH)
     pilot = robust_fit(model, error, robust, scale_m, first, sample=PILOT, heard=heard)
@@ -154,15 +154,15 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances
             errors.slopes({RESIDUAL: residual})[1][RESIDUAL]
             for errors, residual in ((pilot.heard.errors, own), (pilot.rows.errors, pilot.residuals))
         )
-        # Differences of arrival weigh beside ranges by their slopes at the end of the first search.
-        heard = heard.weighed(of_heard, of_ranges, model.pairs.number, blocks)
+        # The weight of differences of arrival follows from their slopes at the end of the first search.
+        heard = heard.with_weight(of_heard, of_ranges, model.pairs.number, blocks)
     if loss == MIXTURE and LEAST_SCALE_M < robust_spread(pilot.residuals) < LARGEST_SPREAD_M:
-        likely = likeliest(model, error, pilot, heard)
+        likely = fit_likelihood(model, error, pilot, heard)
         if _farthest_pair(model, likely.residuals) <= ASTRAY_M + 3 * _farthest_pair(model, pilot.residuals):
-            return described(model, likely, blocks)
+            return with_covariances(model, likely, blocks)
     kinds = [u.kind for u in model.unknowns]
     fitted = robust_fit(model, error, robust, scale_m, kinds, start=pilot, heard=heard)
-    return described(model, fitted, blocks)
+    return with_covariances(model, fitted, blocks)
 
 
 def model_of(ranges: Ranges, settings: FitSettings, *, offsets: bool = True, trimmed: bool = True) -> RangeModel:
@@ -190,9 +190,9 @@ def robust_fit(  # noqa: PLR0913 - a search has that many sides
 ) -> Fitted:
     """Return the optimum of a robust loss of errors (n,), and of differences of arrival, by some kinds of unknowns.
 
-    It is that of a random `sample` of so many ranges, of those `inside` (n,), or of all. The scale follows the
-    residuals of a few steps, unless it is given (`scale_m`), and then stands. Slopes are divided by their dispersion,
-    so that priors weigh against them as against a likelihood.
+    The ranges are a random `sample` of this size, those `inside` (n,), or all. The scale follows the residuals for a
+    few steps, unless it is given (`scale_m`), and is then fixed. Slopes are divided by their dispersion, so that priors
+    have the same weight relative to them as relative to a likelihood.
     """
     weights = LOSSES[loss].weights
     layout, whole = model.build(error, Robust(weights=weights, scale_m=1.0), only=kinds)
@@ -212,7 +212,7 @@ def robust_fit(  # noqa: PLR0913 - a search has that many sides
         residuals = [each.residuals(x) for each in rows]
         scales = [scale_m or max(SCALE_OF_SPREAD * robust_spread(r), LEAST_SCALE_M) for r in residuals]
         errors = [
-            Robust(weights=weights, scale_m=s).tempered(r, effect)
+            Robust(weights=weights, scale_m=s).with_dispersion(r, effect)
             for s, r, effect in zip(scales, residuals, effects, strict=True)
         ]
         rows = [replace(each, errors=own) for each, own in zip(rows, errors, strict=True)]
@@ -222,11 +222,11 @@ def robust_fit(  # noqa: PLR0913 - a search has that many sides
         found = maximize([*rows, *gauge], priors, x, steps=200, evidence_steps=0)
         x, steps = found.x, steps + found.steps
         final = [
-            replace(each, errors=replace(own.tempered(each.residuals(x), effect), least=None))
+            replace(each, errors=replace(own.with_dispersion(each.residuals(x), effect), least=None))
             for each, own, effect in zip(rows, errors, effects, strict=True)
         ]
         ended = maximize([*final, *gauge], priors, x, steps=20, evidence_steps=0)
-        # With few ranges most may lie where the loss is concave; weights then stay in the place of the curvature.
+        # With few ranges most may lie where the loss is concave; then weights are used instead of the curvature.
         if ended.success and _convex(ended):
             found, rows = ended, final
     return Fitted(
@@ -257,7 +257,7 @@ def _convex(optimum: Optimum) -> bool:
     return bool(np.linalg.eigvalsh(own * scale[:, None] * scale)[0] > 1e-10)
 
 
-def likeliest(model: RangeModel, error: Floats, pilot: Fitted, heard: ArrivalModel | None = None) -> Fitted:
+def fit_likelihood(model: RangeModel, error: Floats, pilot: Fitted, heard: ArrivalModel | None = None) -> Fitted:
     """Return the maximum of the likelihood, found from a robust start on samples of growing size and then on all
     ranges."""
     errors, unknowns, parts = model.error_model(pilot.residuals)
@@ -288,8 +288,8 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted, heard: ArrivalMod
 def _maximize_by_samples(
     rows: Sequence[RangeRows], gauge: Sequence[NormalRows], layout: Layout, x: Floats, asked: Ints | None = None
 ) -> tuple[Optimum, int]:
-    """Return the optimum of rows, the first those of ranges, found on samples of growing size and then on all of them,
-    and the steps taken."""
+    """Return the optimum of rows (ranges first), found on samples of growing size and then on all of them, and the
+    number of steps."""
     count, priors, size, steps = len(rows[0]), Priors(layout), FIRST_SAMPLE, 0
     order = np.random.default_rng(0).permutation(count)
     while 2 * size < count:
@@ -300,8 +300,8 @@ def _maximize_by_samples(
     return found, steps + found.steps
 
 
-def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDistances:
-    """Return a fit with the covariances of what was fitted."""
+def with_covariances(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDistances:
+    """Return a fit with the covariances of the fitted values."""
     layout = fitted.optimum.layout
     kept = {
         "delay": Kept.delays(layout.indices(["delay"]), len(fitted.residuals) / len(model.pairs.ends), model.held),
@@ -316,7 +316,7 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDis
     found = sandwich(slopes, kept, fitted.beside)
     covariances = {name: matrix for name, (matrix, _) in found.items()}
     if "offset of pair" in layout.where and "odds of pair" in layout.where:
-        covariances["delay"] = covariances["delay"] + _of_another_shape(fitted.optimum)
+        covariances["delay"] = covariances["delay"] + _covariance_of_other_detours(fitted.optimum)
     return KnownDistances(
         model=model,
         values=model.at_reference(fitted.optimum.by_kind()),
@@ -331,18 +331,18 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDis
 
 
 def noise_kinds(layout: Layout) -> list[str]:
-    """Return the kinds of unknowns that make the noise of a range over power."""
+    """Return the kinds of unknowns that determine the noise of a range over power."""
     return [kind for kind in layout.where if kind.startswith(("noise level", "noise curve"))]
 
 
 SHAPE = 0.1
-"""Shift of a reflected range, in units of noise, when detours do not have the shape of the model. Gamma-distributed
-detours, or two lengths, shift delays by as much (`make worlds`)."""
+"""Shift of a reflected range, in units of noise, when detours have another distribution than the model.
+Gamma-distributed detours, or two lengths, shift delays by this amount (`make worlds`)."""
 
 
-def _of_another_shape(optimum: Optimum) -> Floats:
-    """Return the covariance (tags, tags) of delays due to reflections of another shape, which shift the ranges of a
-    pair.
+def _covariance_of_other_detours(optimum: Optimum) -> Floats:
+    """Return the covariance (tags, tags) of delays due to reflections of another distribution, which shift the ranges
+    of a pair.
 
     Ranges that are longer by b move all unknowns by the covariance times their information on an offset of the pair.
     """
@@ -354,20 +354,20 @@ def _of_another_shape(optimum: Optimum) -> Floats:
     return np.asarray((moved * (SHAPE * share * noise) ** 2) @ moved.T)
 
 
-def _in_sequence(
+def _fit_in_sequence(
     model: RangeModel, error: Floats, loss: str, scale_m: float | None, blocks: TimeBlocks
 ) -> KnownDistances:
     """Fit delays first, then the curves to the residuals, as in ICRA 2023, sections III and IV, with splines.
 
-    The curves keep their constants and the delays are those of the first step, unless a reference power is given.
+    The curves keep their constants and the delays are from the first step, unless a reference power is given.
     """
     free = replace(model, carriers=(None,) * len(model.carriers))
-    first = described(free, robust_fit(free, error, loss, scale_m, ("delay",)), blocks)
+    first = with_covariances(free, robust_fit(free, error, loss, scale_m, ("delay",)), blocks)
     kinds = free.curve_kinds()
-    # Few ranges have the outer powers, and they would bend the curve: it is fitted to the others.
+    # Few ranges have the outer powers, and would bend the curve: it is fitted to the others.
     inside = (free.lifted >= free.span[0]) & (free.lifted <= free.span[1])
     second = robust_fit(free, first.residuals, loss, first.searches[0].scale_m, kinds, inside=inside)
-    curves = described(free, second, blocks)
+    curves = with_covariances(free, second, blocks)
     return replace(
         first,
         model=model,
@@ -380,10 +380,10 @@ def _in_sequence(
 
 @dataclass(frozen=True, kw_only=True)
 class DescribedErrors:
-    """The error model of a fit: unknowns by kind, the covariance of those of the noise, and how each range looks.
+    """The error model of a fit: unknowns by kind, the covariance of the noise's unknowns, and the slopes of each range.
 
-    `slopes` are those of every range (n,) by the residual and the odds, in the order of the model's ranges, for errors
-    less `location_m`.
+    `slopes` are the slopes of every range (n,) by the residual and the odds, in the order of the model's ranges, for
+    errors minus `location_m`.
     """
 
     values: dict[str, Floats]
@@ -393,7 +393,7 @@ class DescribedErrors:
 
 
 def described_errors(found: KnownDistances) -> DescribedErrors:
-    """Return the error model: as it was fitted, or fitted to the residuals of a robust loss."""
+    """Return the error model: the fitted one, or one fitted to the residuals of a robust loss."""
     search, model, location = found.searches[-1], found.model, 0.0
     values, rows, x = found.values, search.rows, search.optimum.x
     if isinstance(rows.errors, Mixture):

@@ -1,7 +1,7 @@
 """The one search: Newton steps to the maximum of the log likelihood of all rows and priors.
 
-The information of the rows (squared slopes of a likelihood) stands for the curvature, corrected by how slopes changed
-over the last steps. The weights of priors that data determine are estimated in the same steps.
+The information of the rows (squared slopes of a likelihood) is used as the curvature, corrected by the changes of
+slopes over the last steps. The weights of priors that data determine are estimated in the same steps.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from calib.estimator.unknowns import Layout, Priors
 from uwblink.arrays import Floats, Ints
 
 SETTLED = 1e-2
-"""A step that promises less log likelihood than this moves no unknown by more than a tenth of its standard error."""
+"""A step with a smaller expected gain of log likelihood moves no unknown by more than a tenth of its standard error."""
 
 EVIDENCE_STEPS = 9
 """Steps near the optimum in which weights of priors are estimated: they converge as fast as the unknowns, then stay.
 Half or twice as many change standard errors of worlds by 4 % (`python -m benchmarks.constants`)."""
 
 MOST_STEPS = 100
-"""Steps after which a search is given up: sound ones take ten to sixty."""
+"""Maximum number of steps of a search: sound searches take ten to sixty."""
 
 LONGER = 2.0
 """How many times longer a corrected step may be than one by the information alone, in standard errors, and by how much
@@ -56,7 +56,7 @@ class Optimum:
         return self.x[self.layout.where[kind]]
 
     def by_kind(self) -> dict[str, Floats]:
-        """Return all unknowns by their kinds."""
+        """Return all unknowns by kind."""
         return {kind: self.x[where] for kind, where in self.layout.where.items()}
 
 
@@ -72,18 +72,18 @@ def maximize(  # noqa: PLR0913 - a search has that many sides
     longest: Callable[[Floats], float] | None = None,
     longer: float = LONGER,
 ) -> Optimum:
-    """Search from unknowns (p,) for the likeliest ones; those that are `asked` for settle more closely.
+    """Search from unknowns (p,) for the likeliest ones; `asked` unknowns converge more closely.
 
     `longest` returns which share of a step (p,) may be taken at most, where unknowns are not linear; `longer` limits
     corrected steps, as `LONGER` says.
 
-    Squared slopes are not quite the curvature: their inverse is corrected by the changes of slopes over the last steps
-    (L-BFGS: Nocedal and Wright 2006, algorithm 7.4), and for steps by `_with_logarithms`. A likelihood that falls
-    shortens the step.
+    Squared slopes are only approximately the curvature: their inverse is corrected by the changes of slopes over the
+    last steps (L-BFGS: Nocedal and Wright 2006, algorithm 7.4), and for steps by `_with_logarithms`. The step is
+    shortened if the likelihood falls.
     """
     layout, free = priors.layout, priors.layout.free()
     most, near, shorter = MOST_STEPS if steps is None else steps, 0, 0
-    # The last 3 to 20 steps do alike (Nocedal and Wright 2006, section 7.2).
+    # The last 3 to 20 steps give equal results (Nocedal and Wright 2006, section 7.2).
     changes = deque[tuple[Floats, Floats]](maxlen=10)
     sums = Sums(-np.inf, np.zeros_like(x), np.zeros((0, 0)))
     best, gain, promised, settled, taken = -np.inf, np.inf, 0.0, False, 0
@@ -94,7 +94,7 @@ def maximize(  # noqa: PLR0913 - a search has that many sides
         value = found.value + priors.value(x)
         if gain < len(free):
             changes.append((x - best_x, sums.gradient - found.gradient))
-        # After eight reductions, to a thousandth or less, a step is taken as it is.
+        # After eight reductions, to a thousandth or less, a step is accepted unchanged.
         if not value >= best - tolerance and shorter < 8:
             # To the maximum of the parabola through both values and the slope (Nocedal and Wright 2006, equation 3.58).
             share = 0.5 * promised / (promised + best - value)
@@ -114,12 +114,12 @@ def maximize(  # noqa: PLR0913 - a search has that many sides
         gain, best = float(slope @ step), value
         settled = gain < tolerance
         if asked is not None:
-            # The others may settle less closely: the log odds of a share of nothing may be any small number.
+            # The others may converge less closely: the log odds of a share of zero may be any large negative number.
             settled = abs(float(slope[asked] @ step[asked])) < tolerance and gain < max(0.3, tolerance)
         near += gain < len(free)
         if near < evidence_steps:
             weights = list(priors.weights)
-            # At the start nothing has moved yet, and says nothing of how far it may.
+            # At the start there are no earlier steps to limit the first one.
             priors.update(x + step, inverse_of(known, free))
             change = [abs(np.log(a / b)) for a, b in zip(priors.weights, weights, strict=True)]
             settled = settled and max(change, default=0.0) < 0.05
@@ -134,7 +134,7 @@ def maximize(  # noqa: PLR0913 - a search has that many sides
 
 
 def _with_uncertainty(rows: Sequence[Rows], priors: Priors, x: Floats) -> Sequence[Rows]:
-    """Return rows whose likelihood depends on it with the variances of their residuals, or the same rows."""
+    """Return the rows with the variances of residuals if their likelihood depends on these, else the same rows."""
     own = {k: one for k, one in enumerate(rows) if isinstance(one, RestrictedRows) and one.restricted}
     if not own:
         return rows
@@ -144,11 +144,11 @@ def _with_uncertainty(rows: Sequence[Rows], priors: Priors, x: Floats) -> Sequen
 
 
 def _with_logarithms(known: Matrix, layout: Layout, slope: Floats, longer: float) -> Matrix:
-    """Return what is known (p, p) with the curvature that logarithms have from a `slope` (p,) of the likelihood.
+    """Return the information (p, p) plus the curvature that logarithms add by the `slope` (p,) of the likelihood.
 
-    The curvature by a share or a length is about its squared slopes. By its logarithm the slope is taken off, so that
-    none falls by more than a factor e a step; by how much one grows is limited by `longer`. Without it a share of
-    nothing, whose squares are small, shortens most steps.
+    The curvature by a share or a length is about its squared slopes. For its logarithm the slope is subtracted, so that
+    no value falls by more than a factor e per step; `longer` limits its growth. Without this a share near zero, whose
+    squared slopes are small, shortens most steps.
     """
     more = np.where(layout.logarithms(), np.maximum(-slope, slope / longer), 0.0)
     if sparse.issparse(known):
@@ -157,7 +157,7 @@ def _with_logarithms(known: Matrix, layout: Layout, slope: Floats, longer: float
 
 
 def _damped(moved: Floats, fell: Floats, expected: Floats) -> Floats:
-    """Return by how much slopes fell (p,) over a move (p,), no less than a fifth of what was expected (p,).
+    """Return the decrease of slopes (p,) over a move (p,), at least a fifth of the expected one (p,).
 
     Powell's damping (Nocedal and Wright 2006, procedure 18.2, with its constant 0.2) keeps the curvature positive.
     """
@@ -171,7 +171,7 @@ def _damped(moved: Floats, fell: Floats, expected: Floats) -> Floats:
 def _corrected(covariance: Inverse, slope: Floats, changes: Sequence[tuple[Floats, Floats]]) -> Floats:
     """Return the step (p,) from a slope (p,) by an inverse curvature that agrees with changes over earlier steps.
 
-    `changes` are how far unknowns moved (p,) and by how much slopes fell (p,), the last one last.
+    `changes` are moves of unknowns (p,) and decreases of slopes (p,), in order of time.
     """
     kept = [(moved, fell, float(moved @ fell)) for moved, fell in changes if float(moved @ fell) > 0]
     rest, shares = slope.copy(), []

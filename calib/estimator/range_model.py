@@ -32,15 +32,16 @@ METRES_A_NS = SPEED_OF_LIGHT * 1e-9
 """Metres that light travels in a nanosecond."""
 
 DELAY_NS = 600.0
-"""Prior standard deviation of a delay: a board without a programmed delay has 514 ns. The prior decides only
-combinations that no range determines, and chooses the smallest delays there."""
+"""Prior standard deviation of a delay: a board without a programmed delay has 514 ns. The prior affects only
+combinations that no range determines, and gives the smallest delays there."""
 
 BOARD_DELAY_STD_NS = 2.0
-"""Prior standard deviation of a programmed board's delay where distances are not known, and a scale of the places can
-pass for a delay: three times the 0.6 ns by which published ones differ."""
+"""Prior standard deviation of a programmed board's delay where distances are unknown and a scale of the places can be
+taken for a delay: three times the difference of published delays (0.6 ns)."""
 
 HELD_NS, HELD_M = 1e-3, 1e-5
-"""Standard deviations of what is set to zero because no range determines it: far below those of any result."""
+"""Standard deviations of combinations that are set to zero because no range determines them: far below the standard
+error of any result."""
 
 CURVE_M = 0.5
 """Prior standard deviation of the bias over power: published curves reach 0.2 m (DW1000 user manual, APS011)."""
@@ -85,9 +86,9 @@ class RangeModel:
     """Unknowns and parts of `ranges` (n,), with curves over `lifted` powers within `span`.
 
     `unknowns` are delays, curves and offsets; `error_model` adds those of errors. `carriers` has for each curve the
-    weights (tags,) with which delays can take over a constant of it, or None: such a curve keeps the constant, which
-    pinned delays determine. Delays have no part along the directions `held` (tags, k), which no range determines and
-    which shift the tags of the groups `free`. `covariates` are what delays depend on in this fit, by setting.
+    weights (tags,) with which delays can absorb its constant; None if the curve keeps its constant, which pinned delays
+    determine. Delays are zero along the directions `held` (tags, k), which no range determines and which shift the tags
+    of the groups `free`. `covariates` are the covariates of delays in this fit, by setting.
     """
 
     ranges: Ranges
@@ -115,11 +116,11 @@ class RangeModel:
         """
         lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, settings.lift, settings.alpha_dbm)
         powered = np.isfinite(lifted)
-        # Ranges without power get the median power, where they do not bend the curve.
+        # Ranges without power get the median power, at which they do not bend the curve.
         lifted = np.where(powered, lifted, np.median(lifted[powered]) if powered.any() else 1.0)
         ordered = np.sort(lifted)
         low, high = populated(ordered)
-        # Lifted powers that differ by less are rounding errors of one.
+        # Smaller differences of lifted powers are rounding errors.
         varied = high - low > 1e-6
         curve = varied and not settings.delays_only
         if curve and trimmed:
@@ -199,7 +200,7 @@ class RangeModel:
         return key
 
     def _carried(self) -> list[tuple[str, Floats, SplineValues]]:
-        """Return kind and carrier of each curve whose constant delays can take, and its splines at the reference
+        """Return kind and carrier of each curve whose constant delays can absorb, and its splines at the reference
         power."""
         if self.curve is None or self.reference is None:
             return []
@@ -207,7 +208,7 @@ class RangeModel:
         return [(kind, one, at) for kind, one in zip(curves, self.carriers, strict=True) if one is not None]
 
     def gauge_rows(self, layout: Layout) -> list[NormalRows]:
-        """Return rows that set curves to zero at the reference power, where delays can take the constant."""
+        """Return rows that set curves to zero at the reference power, if delays can absorb the constant."""
         zero, std = np.zeros(1), np.full(1, HELD_M)
         return [
             NormalRows(value=zero, std=std, entries=at.values, columns=at.columns + layout.where[kind].start)
@@ -215,7 +216,7 @@ class RangeModel:
         ]
 
     def held_rows(self, layout: Layout) -> list[NormalRows]:
-        """Return rows that set free directions of delays to zero: skews of clocks would pin them to 100 ns."""
+        """Return rows that set undetermined directions of delays to zero: clock skews would set them to 100 ns."""
         delays = layout.indices(["delay"])[None]
         return [
             NormalRows(value=np.zeros(1), std=np.full(1, HELD_NS), entries=one[None], columns=delays)
@@ -224,7 +225,7 @@ class RangeModel:
         ]
 
     def at_reference(self, values: Mapping[str, Floats]) -> dict[str, Floats]:
-        """Return unknowns by kind with curves that are zero at the reference power: delays take over the constants."""
+        """Return unknowns by kind with curves that are zero at the reference power: delays absorb the constants."""
         stated = dict(values)
         for kind, carrier, at in self._carried():
             constant_m = float(at.values[0] @ values[kind][at.columns[0]])
@@ -260,8 +261,8 @@ class RangeModel:
         parts: Sequence[Part] = (),
         only: Sequence[str] | None = None,
     ) -> tuple[Layout, RangeRows]:
-        """Return the layout of the model's unknowns, or those of some kinds, and of others after them, and the rows of
-        ranges with residuals (n,)."""
+        """Return the layout of the model's unknowns, or of some kinds, followed by others, and the rows of ranges with
+        residuals (n,)."""
         unknowns = [u for u in self.unknowns if only is None or u.kind in only]
         kinds = {u.kind for u in unknowns}
         layout = Layout((*unknowns, *more))
@@ -270,7 +271,7 @@ class RangeModel:
 
 
 def _free_directions(ranges: Ranges, tags: list[int], settings: FitSettings) -> tuple[Floats, list[Split]]:
-    """Return the directions of delays (tags, k) that the pairs leave free, and their sides."""
+    """Return the directions of delays (tags, k) that the pairs do not determine, and their sides."""
     own = [tag for tag in tags if tag not in settings.fixed_ns]
     if not own or settings.constants == "pair":
         return np.zeros((len(tags), 0)), []
@@ -298,7 +299,7 @@ def _constants(ranges: Ranges, pairs: Pairs, tags: list[int], settings: FitSetti
 
 
 def _curve(kind: str, spline: SplineValues, share: Floats | None) -> tuple[Unknown, Part]:
-    """Return the coefficients of a curve, of which each range has a `share` (n,), None for all of it."""
+    """Return the coefficients of a curve; each range depends on a `share` (n,) of it, None for the whole."""
     rough = Prior(weight=1e2, structure=curvature(spline.knots), bounds=(1e-3, 1e9))
     block = Unknown(
         kind=kind,
@@ -336,20 +337,20 @@ def _offsets(ranges: Ranges, pairs: Pairs, tags: list[int], *, freedom: int) -> 
 
 
 def free_ends(pairs: Pairs, tags: list[int], settings: FitSettings) -> Floats:
-    """Return which of the tags (tags,) with unknown delays each pair has, as 0 and 1 (pairs, tags)."""
+    """Return which tags (tags,) with unknown delays are in each pair, as 0 and 1 (pairs, tags)."""
     free = np.array([tag not in settings.fixed_ns for tag in tags])
     return np.asarray((pairs.ends[:, :, None] == np.array(tags)).sum(axis=1) * free, dtype=np.float64)
 
 
 def _offsets_determined(pairs: Pairs, tags: list[int], settings: FitSettings, carriers: Sequence[Floats | None]) -> int:
-    """Return how many offsets of pairs ranges determine beside delays and constants of curves."""
+    """Return the number of offsets of pairs that ranges determine in addition to delays and constants of curves."""
     taken = len(pairs.ends) if settings.constants == "pair" else np.linalg.matrix_rank(free_ends(pairs, tags, settings))
     return int(len(pairs.ends) - taken - sum(one is None for one in carriers))
 
 
 def _carrier(pairs: Pairs, tags: list[int], settings: FitSettings, group: tuple[int, ...] | None) -> Floats | None:
-    """Return the weights (tags,), or (pairs,) for constants of pairs, with which delays make up for a constant of a
-    group's curve; None where free delays cannot."""
+    """Return the weights (tags,), or (pairs,) for constants of pairs, with which delays replace a constant of a group's
+    curve; None if unknown delays cannot."""
     aim = np.ones(len(pairs.ends)) if group is None else 0.5 * np.isin(pairs.ends, group).sum(axis=1)
     if settings.constants == "pair":
         return aim

@@ -68,13 +68,13 @@ class Errors(Protocol):
 
     @property
     def dispersion(self) -> float:
-        """Return the ratio of the variance of sums of slopes to that of independent draws of the density."""
+        """Return the ratio of the variance of sums of slopes to the variance for independent draws of the density."""
         ...
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
-        """Return log densities (n,), slopes by each parameter (n,) and what a residual tells (n,), or None.
+        """Return log densities (n,), slopes by each parameter (n,) and the information of a residual (n,), or None.
 
-        None stands for the square of the slope.
+        None means the square of the slope.
         """
         ...
 
@@ -83,8 +83,8 @@ class Errors(Protocol):
 class Mixture:
     """Direct, reflected or an outlier (`calib.range_errors.densities`): the likelihood of ranges.
 
-    With `expected` what a residual tells is what the model says on average (Fisher's information), not the square of
-    its slope: where few ranges determine an unknown, such as a place on a path, their squares are too unsteady. With
+    With `expected` the information of a residual is its expectation by the model (Fisher's information), not the square
+    of its slope: if few ranges determine an unknown, such as a place on a path, their squares scatter too much. With
     `restricted` noise is estimated by a restricted likelihood (`RangeRows.with_uncertainty`).
     """
 
@@ -103,11 +103,13 @@ class Mixture:
         sharper = np.exp(typical["noise"] - values["noise"])
         direct = (1 + np.exp(typical["odds"])) / (1 + np.exp(values["odds"]))
         by = sum(part * found.by[name] for part, name in zip(shared, self.parameters, strict=True)) * sharper
-        tells = np.broadcast_to(alone * sharper**2 * direct, found.log_density.shape)
-        return found.log_density, found.by | {SHARED: by}, tells
+        information = np.broadcast_to(alone * sharper**2 * direct, found.log_density.shape)
+        return found.log_density, found.by | {SHARED: by}, information
 
     def _expected(self, typical: dict[str, Floats]) -> tuple[float, Floats]:
-        """Return what a residual tells beside the other parameters, 1/m^2, and how its slope follows theirs (k,)."""
+        """Return the information of a residual if the other parameters are fitted, 1/m^2, and the regression of its
+        slope on theirs (k,).
+        """
         sigma = float(np.exp(typical["noise"][0]))
         longest = 8 * sigma + 30 * float(np.exp(typical["detour"][0]))
         residual = np.concatenate([np.linspace(-8 * sigma, 8 * sigma, 321), np.geomspace(8.1 * sigma, longest, 120)])
@@ -124,8 +126,8 @@ class Mixture:
 class Robust:
     """A robust loss of residuals over `scale_m`; `weights` maps residuals over scale to weights and slopes.
 
-    What a residual tells is the loss's curvature, and no less than a share `least` of its weight: with 1 a search
-    descends from anywhere (reweighted least squares). None stands for the curvature itself.
+    The information of a residual is the loss's curvature, and at least a share `least` of its weight: with 1 a search
+    descends from any start (reweighted least squares). None means the curvature itself.
     """
 
     weights: Weights
@@ -134,20 +136,20 @@ class Robust:
     dispersion: float = 1.0
     parameters: tuple[str, ...] = ()
 
-    def tempered(self, residual: Floats, effect: float = 1.0) -> Robust:
+    def with_dispersion(self, residual: Floats, effect: float = 1.0) -> Robust:
         """Return the loss with its dispersion at residuals (n,): squares of its slopes over its curvature, times the
-        `effect` of errors that correlate."""
+        `effect` of correlated errors."""
         weight, slope = self.weights(residual / self.scale_m)
         square = float(np.mean((weight * residual / self.scale_m) ** 2))
         return replace(self, dispersion=effect * max(square / max(float(np.mean(slope)), 1e-3), 1e-9))
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
-        """Return minus the loss (n,), its slope by the residual (n,) and what each tells (n,)."""
+        """Return minus the loss (n,), its slope by the residual (n,) and the information of each residual (n,)."""
         u = values[RESIDUAL] / self.scale_m
         weight, slope = self.weights(u)
-        tells = (slope if self.least is None else np.maximum(slope, self.least * weight)) / self.scale_m**2
+        information = (slope if self.least is None else np.maximum(slope, self.least * weight)) / self.scale_m**2
         by, value = -weight * u / self.scale_m, -_loss(self.weights)(np.abs(u))
-        return value, {RESIDUAL: by}, tells
+        return value, {RESIDUAL: by}, information
 
 
 @cache
@@ -160,12 +162,12 @@ def _loss(weights: Weights) -> PPoly:
 
 @dataclass(frozen=True, kw_only=True)
 class RangeRows:
-    """Ranges whose residuals are `residual` (n,) plus the parts of the unknowns, less what `geometry` makes of them.
+    """Ranges whose residuals are `residual` (n,) plus the parts of the unknowns, minus the distances of `geometry`.
 
-    Rows are kept sorted by `key`; `order` (n,) says which of the given rows each is. Log likelihoods are divided by
-    the dispersion of the errors. `unsure_m2` (n,), in this order, are variances of the residuals of direct ranges, by
-    which squared residuals are too small (`with_uncertainty`). `exchange` (n,) is the number of the exchange that each
-    given row belongs to; None where a row is an exchange.
+    Rows are kept sorted by `key`; `order` (n,) is the index of each among the given rows. Log likelihoods are divided
+    by the dispersion of the errors. `unsure_m2` (n,), in this order, are variances of the residuals of direct ranges;
+    squared residuals are too small by these (`with_uncertainty`). `exchange` (n,) is the number of the exchange that
+    each given row belongs to; None where a row is an exchange.
     """
 
     residual: Floats
@@ -235,9 +237,9 @@ class RangeRows:
 
     @property
     def restricted(self) -> bool:
-        """Whether their noise depends on how well residuals are known.
+        """Whether their noise depends on the uncertainty of residuals.
 
-        Where unknowns are fewer than a twentieth of the ranges, noise is right to 2.5 % without.
+        With fewer unknowns than a twentieth of the ranges, noise is right to 2.5 % without this.
         """
         kinds = {part.kind for part in self.parts if part.parameter == RESIDUAL}
         count = len(self.layout.indices(list(kinds)))
@@ -250,12 +252,12 @@ class RangeRows:
         )
 
     def with_uncertainty(self, x: Floats, covariance: Inverse) -> RangeRows:
-        """Return these rows with the variances that their residuals have by the covariance (p, p) of unknowns (p,).
+        """Return these rows with the variances of their residuals by the covariance (p, p) of unknowns (p,).
 
         The square of a residual is too small by its variance, because unknowns follow the ranges. Noise is the mean of
         both together (restricted likelihood, by the E step of Dempster, Laird and Rubin 1977), so that offsets which
-        few ranges determine do not bring it to zero. The covariance must be that of expected information: by squares of
-        slopes variances grow with the fourth power of noise, and there may be no end to that.
+        few ranges determine do not reduce it to zero. The covariance must be from expected information: with squares of
+        slopes, variances grow with the fourth power of noise, and may diverge.
         """
         found = np.empty(len(self))
         for blocks, rows, values, _ in self._pieces(x):
@@ -268,14 +270,14 @@ class RangeRows:
     def terms(self, x: Floats) -> Iterator[Terms]:
         """Yield all ranges, some blocks at a time."""
         for blocks, rows, values, moved in self._pieces(x):
-            log_density, by, tells = self.errors.slopes(values)
+            log_density, by, information = self.errors.slopes(values)
             if self.unsure_m2 is not None:
                 over = self.unsure_m2[rows] * np.exp(-2 * values["noise"])
                 log_density, by = log_density - 0.5 * over, by | {"noise": by["noise"] + over}
             share = 1 / self.errors.dispersion
             by = {name: share * slope for name, slope in by.items()} if share != 1 else by
-            tells = None if tells is None else share * tells
-            yield self._as_terms(blocks, rows, share * float(np.sum(log_density)), by, tells, moved)
+            information = None if information is None else share * information
+            yield self._as_terms(blocks, rows, share * float(np.sum(log_density)), by, information, moved)
 
     def residuals(self, x: Floats) -> Floats:
         """Return the residuals (n,) at unknowns (p,), in the order in which rows were given; a sample's in its own."""
@@ -300,7 +302,7 @@ class RangeRows:
         return ErrorSlopes(log_density=log_density, by=by, reflected=reflected, inlier=inlier)
 
     def _pieces(self, x: Floats, only: tuple[str, ...] = ()) -> Iterator[tuple[slice, slice, dict[str, Floats], Any]]:
-        """Yield blocks, rows, parameters and derivatives of distances, for as many rows as are worked on at once."""
+        """Yield blocks, rows, parameters and derivatives of distances, for the rows that are computed at once."""
         names = only or (RESIDUAL, *self.errors.parameters)
         edges, first = self.starts, 0
         while first < len(edges) - 1:
@@ -333,9 +335,11 @@ class RangeRows:
         return found
 
     def _as_terms(
-        self, blocks: slice, rows: slice, value: float, by: dict[str, Floats], tells: Floats | None, moved: Any
+        self, blocks: slice, rows: slice, value: float, by: dict[str, Floats], information: Floats | None, moved: Any
     ) -> Terms:
-        """Return what rows say: by squares of slopes, or by what each residual tells and squares of what is beside."""
+        """Return the terms of rows, with information by squares of slopes, or by the information of each residual and
+        squares of the other slopes.
+        """
         count, several = rows.stop - rows.start, blocks.stop - blocks.start
         starts = self.starts[blocks.start : blocks.stop + 1] - rows.start
         columns, entries, names = [], list[Floats](), list[str]()
@@ -356,11 +360,11 @@ class RangeRows:
         slopes = np.concatenate([by[name] * one for name, one in zip(names, entries, strict=True)])
         score, weight = by[RESIDUAL], self.errors.dispersion
         squares = [Squares(columns=stacked, entries=slopes, residual=score, weight=weight)]
-        if tells is not None:
+        if information is not None:
             chosen = [k for k, name in enumerate(names) if name == RESIDUAL]
             by_residual = np.concatenate([columns[k] for k in chosen], axis=1)
             of_residual = np.concatenate([entries[k] for k in chosen])
-            squares = [Squares(columns=by_residual, entries=of_residual, residual=np.ones(count), weight=tells)]
+            squares = [Squares(columns=by_residual, entries=of_residual, residual=np.ones(count), weight=information)]
             if len(chosen) < len(names):
                 beside = by | {RESIDUAL: by[SHARED]}
                 shared = np.concatenate([beside[name] * one for name, one in zip(names, entries, strict=True)])
@@ -369,7 +373,7 @@ class RangeRows:
 
 
 def _sorted(part: Part, order: Ints, starts: Ints) -> Part:
-    """Return a part in the rows' own order, with columns by block; one row of columns serves all ranges."""
+    """Return a part in the rows' own order, with columns by block; a single row of columns is for all ranges."""
     values = None if part.values is None else np.ascontiguousarray(part.values[order].T)
     return replace(
         part, columns=part.columns if len(part.columns) == 1 else part.columns[order[starts[:-1]]], values=values

@@ -18,18 +18,18 @@ from calib.estimator.inverse import MOST_DENSE, Inverse, Matrix
 from uwblink.arrays import Floats, Ints
 
 ROWS_AT_ONCE = 16_384
-"""Rows that are worked on together, so that what leads to sums stays in the processor's cache."""
+"""Rows that are computed together, so that intermediate results stay in the processor's cache."""
 
 LONG_BLOCKS = 8
-"""Rows a block from which a dense product for each block is faster than a sparse one of all rows."""
+"""Rows per block from which a dense product per block is faster than a sparse product of all rows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Squares:
     """Information of rows (n,): the sum of `weight`, one or (n,), times the outer square of `entries` (K, n).
 
-    The entries are those of the unknowns `columns` (blocks, K). `residual` (n,) are the entries that a unit offset of
-    each row's residual would have.
+    The entries are those of the unknowns `columns` (blocks, K). `residual` (n,) are the entries of a unit offset of
+    each row's residual.
     """
 
     columns: Ints
@@ -40,11 +40,11 @@ class Squares:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Terms:
-    """Some rows (n,) of which each touches K unknowns: blocks of rows that follow each other touch the same ones.
+    """Some rows (n,), each of which depends on K unknowns: the rows of a block depend on the same unknowns.
 
     `slopes` (K, n) are derivatives of a row's log likelihood by the unknowns `columns` (blocks, K), `score` (n,) those
     by its residual; `starts` (blocks + 1,) bound the blocks. The information of the rows is the sum of `squares`: of
-    the slopes themselves (Berndt, Hall, Hall, Hausman 1974), or what rows tell on average.
+    the slopes themselves (Berndt, Hall, Hall, Hausman 1974), or expected information.
     """
 
     value: float
@@ -79,11 +79,11 @@ class RestrictedRows(Rows, Protocol):
         ...
 
     def expecting(self) -> Rows:
-        """Return the rows with the information that they have on average, in place of squares of slopes."""
+        """Return the rows with expected information instead of squares of slopes."""
         ...
 
     def with_uncertainty(self, x: Floats, covariance: Inverse) -> Rows:
-        """Return the rows with the variances of their residuals at unknowns (p,) of a covariance (p, p)."""
+        """Return the rows with the variances of their residuals at unknowns (p,) with a covariance (p, p)."""
         ...
 
 
@@ -108,7 +108,7 @@ def sum_rows(rows: Sequence[Rows], x: Floats) -> Sums:
             sums = np.add.reduceat(terms.slopes, terms.starts[:-1], axis=1)
             gradient += np.bincount(terms.columns.ravel(), sums.T.ravel(), size)
             for part in terms.squares:
-                # One weight of all rows is that of their products, which are fewer.
+                # A common weight of all rows multiplies their products, which are fewer.
                 one = np.ndim(part.weight) == 0
                 weighed, times = (part.entries, part.weight) if one else (part.entries * part.weight, 1.0)
                 if part.entries.shape[1] < LONG_BLOCKS * len(part.columns):
@@ -142,7 +142,8 @@ def _block_products(left: Floats, right: Floats, starts: Ints) -> Floats:
 class NormalRows:
     """Linear measurements with normal errors: `value` (n,) = sum of `entries` (n, K) times the unknowns, +- `std` (n,).
 
-    `columns` (n, K) are indices into all unknowns. A kind that is not linear is a class of its own that yields `Terms`.
+    `columns` (n, K) are indices into all unknowns. A kind that is not linear needs a separate class that yields
+    `Terms`.
     """
 
     value: Floats
@@ -163,7 +164,8 @@ class NormalRows:
 def normal_terms(left: Floats, std: Floats, derivative: Floats, columns: Ints) -> Terms:
     """Return the terms of rows with normal errors from residuals `left` (n,), measured minus predicted.
 
-    `derivative` (K, n) is that of the prediction by the unknowns `columns` (n, K), `std` (n,) the standard deviations.
+    `derivative` (K, n) is the derivative of the prediction by the unknowns `columns` (n, K), `std` (n,) the standard
+    deviations.
     """
     z = left / std
     return Terms(

@@ -1,4 +1,4 @@
-"""Places from lengths between them: where searches begin."""
+"""Places from the lengths between them: the start of searches."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ def scaled_places(
 ) -> Floats:
     """Return `count` places (n, 3) about their centre, in so many dimensions, from lengths (k,) between `ends` (k, 2).
 
-    Classical scaling (Torgerson 1952). What has no length is as far apart as the shortest path over others, or as the
-    longest of these where there is none; all are `most_m` at most. Eigenvalues are `least_m2` at least.
+    Classical scaling (Torgerson 1952). Points without a length have the distance of the shortest path over others, or
+    the longest such distance if there is no path; all are `most_m` at most. Eigenvalues are `least_m2` at least.
     """
     known = np.full((count, count), np.inf)
     known[ends[:, 0], ends[:, 1]] = known[ends[:, 1], ends[:, 0]] = length_m

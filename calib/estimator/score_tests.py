@@ -1,8 +1,8 @@
-"""Rao's score tests of a fit: is one more unknown significant? They need no second fit.
+"""Rao's score tests of a fit: whether one more unknown is significant. They need no second fit.
 
-An alternative is an offset that some ranges would have beside what was fitted. Its slope, less what the fitted unknowns
-would take of it, is summed over short blocks of time and held against its own variance, persistence included. Of
-unknowns that are in the fit already, with a variance by evidence, the same is asked as if they had been left out.
+An alternative is an offset of some ranges in addition to the fitted unknowns. Its slope, minus the part that the fitted
+unknowns would absorb, is summed over short blocks of time and compared with its own variance, persistence included.
+Unknowns that are in the fit already, with an estimated variance, are tested as if they had been omitted.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from calib.estimator.time_blocks import Persistence, TimeBlocks, persistence
 from uwblink.arrays import Floats, Ints
 
 REACHED = 1e-3
-"""Share of an alternative's information that must be left beside the fitted unknowns for it to be tested: with less,
-its standard error is more than thirty times what its own ranges would give."""
+"""Share of an alternative's information that the fitted unknowns must leave for it to be tested: with less, its
+standard error is more than thirty times the one from its own ranges alone."""
 
 SAME = 0.95
-"""Alternatives whose tests correlate by more than this cannot be told from each other: a fault of ten standard errors
-in one shows as 9.5 in the other, 1.6 standard deviations of their difference apart."""
+"""Alternatives whose tests correlate by more than this cannot be distinguished: a fault of ten standard errors in one
+appears as 9.5 in the other, a difference of 1.6 standard deviations."""
 
 MOST_NAMED = 3
-"""Alternatives of a family that are looked for one after the other: faults are few."""
+"""Maximum number of alternatives of a family that are found one after the other: faults are few."""
 
 
 @dataclass(frozen=True, slots=True)
 class Derivative:
-    """A sparse matrix (n, k), made a few rows at a time: rows have `values` (n, m) or (n, 1) at `columns` (n, m)."""
+    """A sparse matrix (n, k), a few rows at a time: rows have `values` (n, m) or (n, 1) at `columns` (n, m)."""
 
     columns: Ints
     values: Floats
@@ -55,11 +55,13 @@ class Derivative:
 
 @dataclass(frozen=True, kw_only=True)
 class Family:
-    """Alternatives of one kind: `derivative` (n, k) is that of the residual of each given range by each offset.
+    """Alternatives of one kind: `derivative` (n, k) is the derivative of the residual of each given range by each
+    offset.
 
-    `names` (k,) say whose they are, `spans` are within how many spans of time to look at how long errors last: two
-    where an alternative does not end. `fitted` are the indices of the unknowns that are these offsets, where they are
-    in the fit already. Where offsets belong to `sessions`, those of one tag or pair in all of them stand side by side.
+    `names` (k,) are their owners. `spans` is the number of spans of time within which the persistence of errors is
+    measured: two if an alternative does not end. `fitted` are the indices of the unknowns that are these offsets, if
+    they are in the fit already. If offsets belong to `sessions`, the offsets of one tag or pair in all sessions are
+    side by side.
     """
 
     kind: str
@@ -72,11 +74,11 @@ class Family:
 
 @dataclass(frozen=True, kw_only=True)
 class FoundOffset:
-    """An alternative that the residuals ask for: its kind, whose it may be, the offset, and what it does to delays.
+    """An alternative that the residuals indicate: its kind, its possible owners, the offset, and its effect on delays.
 
-    `deviation` is how many standard errors the offset is from none, `p_value` how likely so much is by chance in any of
-    the tests. `effects_ns` (1 or 2 of (tags,)) are by how much the delays would change: an offset of one session may as
-    well be the opposite one of all others, which does the second; `sessions` are that session and the others.
+    `deviation` is the offset in standard errors, `p_value` the probability of such a deviation by chance in any of the
+    tests. `effects_ns` (1 or 2 of (tags,)) are the changes of delays: an offset of one session is equivalent to the
+    opposite offset of all others, which has the second effect; `sessions` are that session and the others.
     """
 
     kind: str
@@ -90,9 +92,9 @@ class FoundOffset:
 
     @property
     def spread_ns2(self) -> Floats:
-        """Return the covariance (tags, tags) that delays have when nothing says which side of a difference is off.
+        """Return the covariance (tags, tags) of delays if it is unknown which side of a difference is wrong.
 
-        Where offsets are fitted delays lie halfway between both sides, and their variance is in the intervals already.
+        If offsets are fitted, delays lie halfway between both sides, and intervals already include their variance.
         """
         if self.fitted:
             apart = self.effects_ns[0] - self.effects_ns[-1]
@@ -101,7 +103,7 @@ class FoundOffset:
 
     @property
     def largest_ns(self) -> float:
-        """Return by how much a delay would change at most."""
+        """Return the largest change of a delay."""
         return float(np.max(np.abs(self.effects_ns), initial=0.0))
 
 
@@ -109,8 +111,8 @@ class FoundOffset:
 class Tested:
     """A family and its efficient slopes: sums `total` (k,), their `covariance` (k, k) and `information` (k, k).
 
-    `pulled` (k,) is what the priors of fitted unknowns, such as offsets that scatter, add to the sums. `effects` (tags,
-    k) are in ns/m, `whole` is the largest information that an alternative would have, were nothing else fitted.
+    `pulled` (k,) is the contribution of the priors of fitted unknowns, such as random offsets, to the sums. `effects`
+    (tags, k) are in ns/m, `whole` is the largest information of an alternative without other fitted unknowns.
     """
 
     family: Family
@@ -123,8 +125,8 @@ class Tested:
     lasting: Persistence
     blocks: int
 
-    def turned(self, step: Floats) -> Tested:
-        """Return the slopes of other offsets: those that unit offsets make are the rows of a step (m, k)."""
+    def combined(self, step: Floats) -> Tested:
+        """Return the slopes of other offsets, which are combinations of these: the rows of `step` (m, k)."""
         return replace(
             self,
             total=step @ self.total,
@@ -134,39 +136,39 @@ class Tested:
             pulled=step @ self.pulled,
         )
 
-    def beside(self, fitted: Sequence[int]) -> Tested:
-        """Return the slopes with some offsets fitted too: the others keep what these do not explain."""
+    def with_fitted(self, fitted: Sequence[int]) -> Tested:
+        """Return the slopes if some offsets are fitted, too: the others keep the part that these do not explain."""
         which, step = np.array(fitted, dtype=np.int64), np.eye(len(self.total))
         own = self.information[np.ix_(which, which)]
         step[:, which] -= self.information[:, which] @ np.linalg.pinv(own, rcond=1e-9, hermitian=True)
-        return self.turned(step)
+        return self.combined(step)
 
 
 class Slopes:
-    """The slopes of a fit's ranges by the residual and by all unknowns, as sums and products that tests are made of.
+    """The slopes of a fit's ranges by the residual and by all unknowns, as the sums and products that tests need.
 
-    `own` (blocks, p) are the slopes by unknowns of `count` rows, summed by block of time; where a search has rows of
-    another kind beside these, of all (`Fitted.slopes`). `score` (n,) are the slopes by residuals,
-    `tells` (n,) what residuals know, in the order of the rows. Slopes by unknowns are evaluated anew for tests: those
-    of millions of ranges take gigabytes.
+    `own` (blocks, p) are the slopes by unknowns of `count` rows, summed by block of time; if a search has rows of
+    several kinds, of all rows (`Fitted.slopes`). `score` (n,) are the slopes by residuals, `information` (n,) the
+    information of residuals, in the order of the rows. Slopes by unknowns are evaluated anew for tests: those of
+    millions of ranges take gigabytes.
     """
 
     def __init__(self, rows: RangeRows, optimum: Optimum, blocks: TimeBlocks) -> None:
-        """Take rows at their optimum."""
+        """Evaluate rows at their optimum."""
         self.rows, self.optimum, self.blocks = rows, optimum, blocks
         self.order, size = rows.order, optimum.layout.size
-        self.score, self.tells = np.empty(len(rows)), np.zeros(len(rows))
+        self.score, self.information = np.empty(len(rows)), np.zeros(len(rows))
         self.own = np.zeros((blocks.count, size))
         for which, terms in self._pieces():
             slopes = terms.as_matrix(terms.slopes, terms.columns, size)
             self.own += (blocks.summing(self.order[which]) @ slopes).toarray()
             self.score[which] = terms.score
             for part in terms.squares:
-                self.tells[which] += part.residual * part.weight * part.residual
+                self.information[which] += part.residual * part.weight * part.residual
         self.count = len(rows)
 
     def _pieces(self) -> Iterator[tuple[slice, Terms]]:
-        """Yield which rows, and their terms."""
+        """Yield the indices of some rows, and their terms."""
         at = 0
         for terms in self.rows.terms(self.optimum.x):
             which = slice(at, at + terms.slopes.shape[1])
@@ -174,7 +176,7 @@ class Slopes:
             at = which.stop
 
     def link(self, derivative: Derivative | sparse.csr_matrix) -> Floats:
-        """Return what links offsets, as derivatives (n, k) of given ranges, to all unknowns (k, p)."""
+        """Return the information (k, p) between offsets, as derivatives (n, k) of given ranges, and all unknowns."""
         return self._sums([derivative])[0][3]
 
     def test(self, family: Family) -> Tested:
@@ -182,9 +184,9 @@ class Slopes:
         return self.tests([family])[0]
 
     def tests(self, families: Sequence[Family], more: Floats | None = None) -> list[Tested]:
-        """Return the efficient slopes of families, whose sums are taken in one pass over the ranges.
+        """Return the efficient slopes of families, whose sums are computed in one pass over the ranges.
 
-        With derivatives of the ranges by one offset `more` (n,), each family has that one as its last.
+        With derivatives of the ranges by one offset `more` (n,), this offset is the last of each family.
         """
         sums = self._sums([family.derivative for family in families], more)
         return [self._tested(family, *own) for family, own in zip(families, sums, strict=True)]
@@ -194,14 +196,14 @@ class Slopes:
     ) -> list[list[Floats]]:
         """Return sums over all ranges for offsets with derivatives (n, k) of given ranges, and for one `more` (n,).
 
-        By block of time, those of slopes (blocks, k) and of what residuals know (blocks, k); then what offsets know of
-        each other (k, k), and what they share with the unknowns (k, p).
+        By block of time: sums of slopes (blocks, k) and of the information of residuals (blocks, k). Of all: the
+        information between offsets (k, k), and between offsets and unknowns (k, p).
         """
         (blocks, size), counts = self.own.shape, [each.shape[1] + (more is not None) for each in derivatives]
         sums = [[np.zeros(shape) for shape in ((blocks, k), (blocks, k), (k, k), (k, size))] for k in counts]
         for which, terms in self._pieces():
             rows = self.order[which]
-            in_block, told = self.blocks.summing(rows), sparse.diags(self.tells[which])
+            in_block, weights = self.blocks.summing(rows), sparse.diags(self.information[which])
             shared = [
                 terms.as_matrix(part.residual * part.weight * part.entries, part.columns, size)
                 for part in terms.squares
@@ -210,21 +212,21 @@ class Slopes:
             for own, derivative in zip(sums, derivatives, strict=True):
                 kept = sparse.csr_matrix(sparse.hstack([derivative[rows], *last]))
                 own[0] += (in_block @ sparse.diags(self.score[which]) @ kept).toarray()
-                own[1] += (in_block @ told @ kept.power(2)).toarray()
-                own[2] += (kept.T @ told @ kept).toarray()
+                own[1] += (in_block @ weights @ kept.power(2)).toarray()
+                own[2] += (kept.T @ weights @ kept).toarray()
                 for matrix in shared:
                     own[3] += (kept.T @ matrix).toarray()
         return sums
 
     def _tested(self, family: Family, plain: Floats, known: Floats, square: Floats, link: Floats) -> Tested:
-        taken = self._taken(link, family.fitted)
-        efficient, information = plain - self.own @ taken.T, square - taken @ link.T
+        absorbed = self._absorbed(link, family.fitted)
+        efficient, information = plain - self.own @ absorbed.T, square - absorbed @ link.T
         whole = max(float(np.diag(square)[: family.derivative.shape[1]].max()), 1e-300)
         total = efficient.sum(axis=0)
         if len(family.fitted):
-            # The quadratic that the likelihood is near its top says what the slopes were without these unknowns.
+            # The quadratic approximation of the likelihood gives the slopes without these unknowns.
             total = total + information[:, : len(family.fitted)] @ self.optimum.x[family.fitted]
-        # An offset is in every block by as much as a block knows of it: it is no scatter between them.
+        # Each block has the share of an offset that its information has: this is no scatter between blocks.
         whose = known.sum(axis=0)
         share = np.where(whose > 0, efficient.sum(axis=0) / np.where(whose > 0, whose, 1.0), 0.0)
         scatter = efficient - known * share
@@ -235,34 +237,36 @@ class Slopes:
             total=total,
             covariance=lasting.factor * (scatter.T @ scatter),
             information=information,
-            effects=-taken.T[self.optimum.layout.where["delay"]],
-            pulled=-taken @ self.optimum.priors.pull(self.optimum.x),
+            effects=-absorbed.T[self.optimum.layout.where["delay"]],
+            pulled=-absorbed @ self.optimum.priors.pull(self.optimum.x),
             whole=whole,
             lasting=lasting,
             blocks=len(scatter),
         )
 
-    def _taken(self, link: Floats, fitted: Ints) -> Floats:
-        """Return what the unknowns take of offsets (k, p), without those that are `fitted` already."""
+    def _absorbed(self, link: Floats, fitted: Ints) -> Floats:
+        """Return the parts of offsets that the unknowns absorb (k, p), without unknowns that are `fitted` offsets."""
         inverse = self.optimum.covariance
-        taken = np.asarray(inverse @ link.T)
+        absorbed = np.asarray(inverse @ link.T)
         if len(fitted):
-            # Blockwise inversion: what is left when rows and columns are struck from the matrix itself.
+            # Blockwise inversion: the inverse after rows and columns are removed from the matrix itself.
             columns = inverse[:, fitted]
-            taken = taken - columns @ np.linalg.solve(columns[fitted], taken[fitted])
-            taken[fitted] = 0.0
-        return taken.T
+            absorbed = absorbed - columns @ np.linalg.solve(columns[fitted], absorbed[fitted])
+            absorbed[fitted] = 0.0
+        return absorbed.T
 
 
 def search(tested: Sequence[Tested], rate: float) -> list[FoundOffset]:
-    """Return what stands out of all families, the gravest first; of sound fits the share `rate` has any finding."""
+    """Return the significant alternatives of all families, the most significant first; a share `rate` of sound fits has
+    any.
+    """
     several = sum(len(one.family.names) for one in tested)
     found = [finding for one in tested for finding in findings(one, several, rate)]
     return sorted(found, key=lambda finding: finding.p_value)
 
 
 def findings(tested: Tested, several: int, rate: float, tolerance_m: float = 0.0) -> Iterator[FoundOffset]:
-    """Yield the alternatives of a family that stand out, one after the other, each beside those already found.
+    """Yield the significant alternatives of a family, one after the other, each with the previous ones fitted.
 
     Offsets up to the tolerance are no finding.
     """
@@ -277,7 +281,7 @@ def findings(tested: Tested, several: int, rate: float, tolerance_m: float = 0.0
         p_value = min(several * 2 * float(stdtr(freedom, -abs(float(deviation[top])))), 1.0)
         if p_value > rate:
             return
-        # Residuals are fitted less true: an offset that they ask for is one that the ranges have too little.
+        # Residuals are fitted minus true: the offset of ranges has the opposite sign.
         offset = float(total[top] / information[top, top])
         alike = np.abs(covariance[top] / (std[top] * std)) > SAME
         close = alike & known & (np.abs(deviation) > SAME * abs(deviation[top]))
@@ -299,13 +303,13 @@ def findings(tested: Tested, several: int, rate: float, tolerance_m: float = 0.0
             sessions=sessions,
             fitted=len(family.fitted) > 0,
         )
-        tested = tested.beside([top])
+        tested = tested.with_fitted([top])
 
 
 def widening(tested: Tested) -> Floats:
-    """Return the covariance (tags, tags) of delays by offsets that scatter more than their slopes allow.
+    """Return the covariance (tags, tags) of delays by offsets whose scatter exceeds the uncertainty of their slopes.
 
-    They are taken for draws with one variance, estimated by the method of moments (DerSimonian and Laird 1986): the
+    They are taken as random with one variance, estimated by the method of moments (DerSimonian and Laird 1986): the
     weighted square of all slopes exceeds its expectation by the variance times a trace.
     """
     values, vectors = np.linalg.eigh(tested.information)

@@ -1,11 +1,11 @@
-"""Short blocks of the time that ranges cover, and how long errors last, from sums over such blocks.
+"""Short blocks of the time that ranges cover, and the persistence of errors, from sums over such blocks.
 
-Time counts only where there are ranges. Sessions are laid end to end, and gaps within a session are left out: nothing
-of an error is measured in a gap, so a pause of hours must neither lengthen blocks nor count as time recorded.
+Time counts only where there are ranges. Sessions are laid end to end, and gaps within a session are left out: a gap has
+no measurements, so a pause of hours must neither lengthen blocks nor count as recorded time.
 
-Errors that share a cause (a reflection, a pose) come in stretches. How much more sums over them vary is fitted with an
-autocorrelation a rho^h. That sums over a whole recording are zero by construction (a fit leaves no slope) is reckoned
-with: it hides errors that last for a good part of the recording.
+Errors that share a cause (a reflection, a pose) last for some time. The increase of the variance of sums is fitted with
+an autocorrelation a rho^h. The fit makes sums over a whole recording zero, which hides errors that last for a large
+part of the recording; this is included.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ from calib.data.ranges import Ranges
 from uwblink.arrays import Floats, Ints
 
 GAP_S: Final = 10.0
-"""Ranges that are further apart than this, and than twenty usual intervals, have a gap in between. Errors in recordings
+"""There is a gap between ranges that are further apart than this and than twenty usual intervals. Errors in recordings
 last for seconds (docs/accuracy.md); slow schedules and pairs in turn make no gaps."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimeBlocks:
-    """Blocks of time: `number` (n,) is the block of each range, `bounds` (sessions + 1,) are the blocks of sessions.
+    """Blocks of time: `number` (n,) is the block of each range, `bounds` (sessions + 1,) are the first blocks of
+    sessions.
 
-    `seconds` is how much time the ranges cover.
+    `seconds` is the time that the ranges cover.
     """
 
     number: Ints
@@ -47,9 +48,9 @@ class TimeBlocks:
         return sparse.csr_matrix((np.ones(len(rows)), place), shape=(self.count, len(rows)))
 
     def pieces(self, series: Floats, spans: int = 1) -> Floats:
-        """Return sums by block (blocks, k) as columns of pieces of equal length, less their means.
+        """Return sums by block (blocks, k) as columns of pieces of equal length, minus their means.
 
-        There are about as many pieces as `spans`, and none of two sessions. A single piece is the series as it is.
+        There are about as many pieces as `spans`; no piece crosses sessions. A single piece is the unchanged series.
         """
         sizes = np.diff(self.bounds)
         spans = min(spans, self.count)
@@ -75,10 +76,10 @@ def in_order(ranges: Ranges) -> Ranges:
 
 
 def time_blocks(time_ns: Ints, session: Ints) -> TimeBlocks:
-    """Cut the time that ranges (n,) cover into a thousand short blocks, fewer where these were shorter than 0.1 s.
+    """Cut the time that ranges (n,) cover into a thousand short blocks, fewer if these would be shorter than 0.1 s.
 
-    Ranges are in order of their sessions, and of time within each. A block ends where a session or a gap does. There
-    are thirty blocks at least: with fewer than unknowns (some twenty) the covariance of block sums is singular.
+    Ranges are in order of their sessions, and of time within each. Blocks do not cross sessions or gaps. There are
+    thirty blocks at least: with fewer blocks than unknowns (some twenty) the covariance of block sums is singular.
     """
     steps = np.diff(time_ns, prepend=time_ns[:1])
     changed = np.diff(session, prepend=session[:1]) != 0
@@ -95,8 +96,8 @@ def time_blocks(time_ns: Ints, session: Ints) -> TimeBlocks:
 
 
 FEWEST_STRETCHES: Final = 20.0
-"""With fewer independent stretches of time an interval is a guess: a variance over twenty is known to a third (the root
-of 2/19)."""
+"""Minimum number of independent stretches of time for a reliable interval: a variance over twenty is known to a third
+(the root of 2/19)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,7 +119,9 @@ class Persistence:
 
 
 def lasting_in_pairs(slope: Floats, pair: Ints, blocks: TimeBlocks, spans: int = 1) -> float:
-    """Return the variance of sums of slopes (n,) by pair (n,) in so many spans, over that of independent ranges."""
+    """Return the variance of sums of slopes (n,) by pair (n,) in `spans` spans, divided by the variance for independent
+    ranges.
+    """
     pairs = int(pair.max()) + 1
     flat = np.bincount(blocks.number * pairs + pair, slope, blocks.count * pairs)
     sums: Floats = flat.astype(np.float64).reshape(blocks.count, pairs)
@@ -127,9 +130,9 @@ def lasting_in_pairs(slope: Floats, pair: Ints, blocks: TimeBlocks, spans: int =
 
 
 def persistence(slopes: Floats, time: TimeBlocks, independent: int, within: int = 1) -> Persistence:
-    """Return the effect of persistence on sums of slopes (blocks, k), of whose columns so many are independent.
+    """Return the effect of persistence on sums of slopes (blocks, k), with this number of independent columns.
 
-    Persistence is measured within sessions and within so many spans of time (`within`). Differences between these are
+    Persistence is measured within sessions and within spans of time (`within` of them). Differences between these are
     tested separately (`calib.checks.fitted`).
     """
     slopes, columns = time.pieces(slopes, within), slopes.shape[1]
@@ -137,12 +140,12 @@ def persistence(slopes: Floats, time: TimeBlocks, independent: int, within: int 
     blocks = len(slopes)
     size = np.sum(slopes**2, axis=0)
     series = slopes[:, size > 0] / np.sqrt(size[size > 0])
-    # Eight sums at least are compared: the variance of fewer is hardly known.
+    # At least eight sums are compared: the variance of fewer is too uncertain.
     scales = [2**k for k in range(1, 12) if blocks // 2**k >= 8]
     if not series.shape[1] or not scales:
         return Persistence(factor=1.0, freedom=max(blocks - 1.0, 1.0), stretches=float(time.count), stretch_s=0.0)
     found = np.log([_ratio(series, scale) for scale in scales])
-    # Sums over 2 and over 4 blocks share blocks: together they know half of what independent ones would.
+    # Sums over 2 and over 4 blocks share blocks: together they have half of the information of independent sums.
     certain = 0.5 * max(independent, 1) * blocks / np.array(scales) / 2
     # Errors that last longer than a sixth of a recording cannot be distinguished from delays.
     rho = np.exp(-1 / np.geomspace(0.3, blocks / 6, 40))
@@ -169,7 +172,7 @@ def persistence(slopes: Floats, time: TimeBlocks, independent: int, within: int 
 
 
 def _ratio(series: Floats, scale: int) -> float:
-    """Return the mean square of sums over `scale` blocks over that of single ones, times as many."""
+    """Return the mean square of sums over `scale` blocks, divided by `scale` times the mean square of single blocks."""
     whole = len(series) // scale * scale
     sums = series[:whole].reshape(-1, scale, series.shape[1]).sum(axis=1)
     return max(float(np.sum(sums**2) / max(np.sum(series[:whole] ** 2), 1e-300)), 1e-6)

@@ -1,8 +1,9 @@
 """A calibration from a fit: delays, curves, their uncertainty, and the error model of future ranges.
 
-Reflections last, so the share of reflections of a pair in one recording predicts its share in another less well than
-independent ranges would. The loss of information is estimated from sums of slopes over blocks of time. Parameters of
-pairs are shrunk to their common value accordingly, and the remaining uncertainty of a share enters the predicted share.
+Reflections last, so the share of reflections of a pair in one recording predicts its share in another with less
+certainty than for independent ranges. The loss of information is estimated from sums of slopes over blocks of time.
+Parameters of pairs are shrunk to their common value accordingly, and the remaining uncertainty of a share enters the
+predicted share.
 """
 
 from __future__ import annotations
@@ -34,19 +35,20 @@ LEAST_SPREAD_M = 1e-6
 """Smallest noise: errors without spread have no distribution."""
 
 NODES = 8
-"""Number of powers at which noise and share are stated; between them both are linear: twice the segments of the curve
-of the noise."""
+"""Number of powers at which noise and share are stated, twice the segments of the curve of noise; both are linear
+between them."""
 
 QUANTILE_SHARES = (0.005, 0.025, 0.05, 0.16, 0.5, 0.84, 0.95, 0.975, 0.995)
 """Shares of errors at which the model's quantiles are corrected."""
 
 BEYOND_MEANS = 8.0
 """Errors longer than so many means of the longer detours are excluded from the total sigma. An exponential distribution
-has 0.03 % of its values beyond, which carry 1.4 % of its mean square."""
+has 0.03 % of its values beyond; they are 1.4 % of its mean square."""
 
 WIDEST_ODDS, WIDEST_DETOUR = 4.0, 1.0
 """Variances of a pair's log odds and log detour: two in three pairs between an eighth and eight times the common odds,
-a third and three times the common detour. What a few lasting reflections leave open is more than any room has."""
+a third and three times the common detour. The uncertainty after a few lasting reflections is larger than the variation
+in any room."""
 
 
 SPELLS = 8
@@ -54,7 +56,7 @@ SPELLS = 8
 (the root of 2/(7 * 28)); over a single pair to half."""
 
 BETWEEN_M = 0.05
-"""Standard deviation of a pair's offset between recordings, where only one is fitted.
+"""Standard deviation of a pair's offset between recordings if only one is fitted.
 
 4 cm by which pairs of MILUV differ between two days (3.2 to 4.3 cm), and 2.15 mm/K for each of both tags (DW1000 user
 manual, section 8.3.1) whose temperatures differ by 10 K. Chosen without STAR-loc, on which it is tested.
@@ -117,7 +119,7 @@ def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
 
 
 def patterns_of(found: KnownDistances) -> tuple[Pattern, ...]:
-    """Return the patterns over direction of a fit: one that all tags share, or one of each tag."""
+    """Return the patterns over direction of a fit: one for all tags, or one for each tag."""
     directions, values = found.model.covariates.get("pattern"), found.values
     if directions is None:
         return ()
@@ -133,13 +135,13 @@ def patterns_of(found: KnownDistances) -> tuple[Pattern, ...]:
 
 
 def temperatures_of(found: KnownDistances) -> tuple[TemperatureSlope, ...]:
-    """Return the slopes over temperature of a fit: one that all tags share, or one of each tag."""
+    """Return the slopes over temperature of a fit: one for all tags, or one for each tag."""
     known, values = found.model.covariates.get("temperature"), found.values
     if known is None:
         return ()
     own = values.get(OWN_WARMTH, np.zeros(0))
     whose = [(tag,) for tag in known.tags] if len(own) else [known.tags]
-    # A tag's slope is the common one and its own, side by side among the unknowns.
+    # A tag's slope is the sum of the common one and its own, which follow each other among the unknowns.
     sums = np.column_stack([np.ones(len(whose)), np.eye(len(own))]) if len(own) else np.ones((1, 1))
     slopes = sums @ np.append(values[WARMTH], own)
     covariance = found.covariances["temperature"][-sums.shape[1] :, -sums.shape[1] :]
@@ -150,7 +152,7 @@ def temperatures_of(found: KnownDistances) -> tuple[TemperatureSlope, ...]:
 
 
 def bias_curves(found: KnownDistances) -> dict[str, Curve]:
-    """Return the curve of each group, zero at the reference power where delays take its constant."""
+    """Return the curve of each group, zero at the reference power if delays absorb its constant."""
     model = found.model
     if model.curve is None:
         return dict.fromkeys(model.settings.groups or ("",), flat_curve(0.0, model.span))
@@ -166,7 +168,8 @@ def sigma_curves(
 ) -> tuple[dict[str, Curve], Floats]:
     """Return the noise of direct ranges over power for each group, and the covariance of their average (m, m).
 
-    `covariance` is that of level and curves of the logarithm of noise, side by side. The curves are splines through it.
+    `covariance` is the covariance of level and curves of the logarithm of noise. The curves are splines through the
+    noise.
     """
     level = float(values["noise level"][0])
     if model.noise is None:
@@ -203,7 +206,7 @@ def _correction_std(found: KnownDistances, delays_ns2: Floats, lifted: Floats) -
         delays = np.sum(model.pairs.ends[:, :, None] == np.array(model.tags), axis=1) * METRES_A_NS / 2
         of_pairs = np.sum(delays @ delays_ns2 * delays, axis=1)
     if (directions := model.covariates.get("pattern")) is not None:
-        # What belongs to places, and depends on direction there, is not corrected.
+        # Effects of places that depend on direction are not corrected.
         parts = ((*directions.entries(kind, model.pairs)[1:], found.values[kind]) for kind in OF_PLACES)
         left = sum(np.sum(entries * values[columns], axis=1) for columns, entries, values in parts)
         of_pairs = of_pairs + np.var(left)
@@ -235,11 +238,11 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
     found = errors.slopes
     lasting = lasting_in_pairs(found.by["odds"], number, blocks)
     pairs = len(model.pairs.ends)
-    told = np.bincount(number, found.by["odds"] ** 2, pairs)
+    information = np.bincount(number, found.by["odds"] ** 2, pairs)
     # A wall has one detour: the number of reflections counts for the mean, not the number of ranges.
     reflected = np.bincount(number, found.reflected, pairs)
     odds, odds_var, any_odds, any_odds_var = _shrunk_to_mean(
-        values["odds of pair"], lasting / np.maximum(told, 1e-6), WIDEST_ODDS
+        values["odds of pair"], lasting / np.maximum(information, 1e-6), WIDEST_ODDS
     )
     detour, detour_var, any_detour, any_detour_var = _shrunk_to_mean(
         values["detour of pair"], lasting / np.maximum(reflected, 1e-6), WIDEST_DETOUR
@@ -284,8 +287,8 @@ def between_recordings(found: KnownDistances, errors: DescribedErrors) -> float:
     """Return the standard deviation, in metres, of the difference of a pair's offset between this and another
     recording.
 
-    Several sessions show it: by offsets of pairs, if they are determined, and of pairs in spells. One recording does
-    not, because its delays contain what changes by the next; it shows the least.
+    Several sessions determine it: by offsets of pairs, if these are determined, and by offsets of pairs in spells. One
+    recording determines only a lower bound, because its delays contain the offsets that change until the next one.
     """
     optimum, pair, score = found.searches[0].optimum, found.model.pairs.number, errors.slopes.by[RESIDUAL]
     pairs, cell = len(found.model.pairs.ends), pair * SPELLS + np.arange(len(pair)) * SPELLS // len(pair)
@@ -304,23 +307,23 @@ def between_recordings(found: KnownDistances, errors: DescribedErrors) -> float:
 def mean_variance(information: Floats, slope: Floats, typical: float, bounds: tuple[float, float]) -> float:
     """Return the posterior mean of the variance of independent draws (k,).
 
-    `information` (k,) and `slope` (k,) are those of the log likelihood of each draw at zero: its marginal likelihood
-    under a variance s is (1 + s l)^-1/2 exp(b^2 s / (1 + s l) / 2). The prior of the standard deviation is half-normal
-    with scale `typical`, within `bounds` (Gelman 2006). The maximum of the likelihood would be zero with few uncertain
-    values.
+    `information` (k,) and `slope` (k,) are information and slope of the log likelihood of each draw at zero: its
+    marginal likelihood under a variance s is (1 + s l)^-1/2 exp(b^2 s / (1 + s l) / 2). The prior of the standard
+    deviation is half-normal with scale `typical`, within `bounds` (Gelman 2006). With few uncertain values the maximum
+    of the likelihood would be at zero.
     """
     deviation = np.geomspace(*bounds, 200)
     variance = deviation[:, None] ** 2
-    told = 1 + variance * information
-    likelihood = 0.5 * np.sum(slope**2 * variance / told - np.log(told), axis=1)
-    # In steps of the logarithm, each is as wide as the deviation.
+    spread = 1 + variance * information
+    likelihood = 0.5 * np.sum(slope**2 * variance / spread - np.log(spread), axis=1)
+    # The steps are equal in the logarithm, so their widths are proportional to the deviation.
     posterior = likelihood - 0.5 * (deviation / typical) ** 2 + np.log(deviation)
     share = np.exp(posterior - posterior.max())
     return float(share @ deviation**2 / share.sum())
 
 
 def _at_nodes(model: RangeModel, values: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
-    """Return lifted powers (NODES,), the noise there in metres, and the log odds there less their level."""
+    """Return lifted powers (NODES,), the noise there in metres, and the log odds there minus their level."""
     level = float(values["noise level"][0])
     if model.noise is None:
         return np.array([0.999, 1.001]) * np.median(model.lifted), np.full(2, np.exp(level)), np.zeros(2)
@@ -334,7 +337,8 @@ def _at_nodes(model: RangeModel, values: dict[str, Floats]) -> tuple[Floats, Flo
 
 
 def _shrunk_to_mean(value: Floats, variance: Floats, widest: float) -> tuple[Floats, Floats, float, float]:
-    """Shrink values (pairs,) with known variances to their mean; return them, their variances, and those of a new pair.
+    """Shrink values (pairs,) with known variances to their mean; return them, their variances, and value and variance
+    of a new pair.
 
     The variance between pairs is the maximum of a normal likelihood (by expectation-maximisation). Returned variances
     are `widest` at most.
@@ -352,16 +356,16 @@ def _shrunk_to_mean(value: Floats, variance: Floats, widest: float) -> tuple[Flo
 
 
 def _expected_odds(log_odds: Floats, variance: Floats) -> Floats:
-    """Return the log odds of the mean share, where log odds are known with a variance (MacKay 1992)."""
+    """Return the log odds of the mean share, for log odds with a variance (MacKay 1992)."""
     return np.asarray(log_odds / np.sqrt(1 + np.pi / 8 * variance))
 
 
 def _with_quantiles(model: ErrorModel, of: RangeModel, residual: Floats) -> ErrorModel:
     """Correct the quantiles and the total standard deviation so that they hold for the fitted ranges on average."""
     if len(residual) < 200:
-        # Two hundred ranges know the outer quantiles, those of half a per cent, by one range.
+        # With two hundred ranges, one range determines the outer quantiles (0.5 %).
         return model
-    # More than 20 000 ranges change nothing.
+    # More than 20 000 ranges do not change the result.
     rows = np.linspace(0, len(residual) - 1, min(20_000, len(residual))).astype(np.int64)
     error = residual[rows]
     some = of.ranges[rows]

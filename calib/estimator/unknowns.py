@@ -2,7 +2,8 @@
 
 A block is a named vector with a start and Gaussian priors. The weight of a prior may be estimated with the unknowns, by
 the fixed point of Fellner and Schall as Wood and Fasiolo (Biometrics 2017) generalise it: the roughness of a curve, the
-variance of offsets between pairs and between sessions, and the spread of error models between pairs are one mechanism.
+variance of offsets between pairs and between sessions, and the spread of error models between pairs are estimated in
+this one way.
 """
 
 from __future__ import annotations
@@ -23,9 +24,8 @@ from uwblink.arrays import Bools, Floats, Ints
 class Prior:
     """A Gaussian prior with the precision `weight` times `structure` (k, k), about `centre` (k,).
 
-    `structure` None is the identity; that of many unknowns is sparse, and made of as many independent rows as `rows`
-    says. With `bounds` the weight is estimated between them, starting at `weight`, by data with so many degrees of
-    `freedom`.
+    `structure` None is the identity; for many unknowns it is sparse, with `rows` independent rows. With `bounds` the
+    weight is estimated between them, starting at `weight`, from data with `freedom` degrees of freedom.
     """
 
     weight: float
@@ -86,7 +86,7 @@ class Layout:
     where: dict[str, slice] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Lay the blocks out; raises `BadInputError` where two are of one kind."""
+        """Compute the indices of the blocks; raises `BadInputError` if two have one kind."""
         kinds = [block.kind for block in self.blocks]
         twice = [kind for kind in kinds if kinds.count(kind) > 1]
         if twice:
@@ -143,7 +143,7 @@ class Priors:
         return dict(zip(self.keys, self.weights, strict=True))
 
     def recall(self, known: Mapping[tuple[str, int], float]) -> None:
-        """Use the weights of an earlier search for the priors that it had."""
+        """Use the weights of an earlier search for the priors that both have."""
         self.weights = [known.get(key, weight) for key, weight in self.by_key().items()]
 
     def precision(self) -> Matrix:
@@ -157,7 +157,7 @@ class Priors:
         return found
 
     def value(self, x: Floats) -> float:
-        """Return the log density of the priors at unknowns (p,), less its constant."""
+        """Return the log density of the priors at unknowns (p,), minus its constant."""
         return -0.5 * sum(weight * float(away @ pulled) for weight, _, away, pulled in self._distances(x))
 
     def pull(self, x: Floats) -> Floats:
@@ -177,11 +177,11 @@ class Priors:
                 self.weights[k] = float(np.clip(max(left, 1e-2) / size, *bounds))
 
     def deviation(self, kind: str) -> float:
-        """Return the standard deviation that the last prior of a kind has now."""
+        """Return the present standard deviation of the last prior of a kind."""
         return float({own: weight for (own, _), weight in self.by_key().items()}[kind] ** -0.5)
 
     def _distances(self, x: Floats) -> list[tuple[float, slice, Floats, Floats]]:
-        """Return of each prior its weight, block, distance from the centre (k,), and structure times distance (k,)."""
+        """Return weight, block, distance from the centre (k,), and structure times distance (k,) of each prior."""
         away = [x[where] - prior.centre for where, prior in self.all]
         pulled = [np.asarray(matrix @ own) for matrix, own in zip(self.structures, away, strict=True)]
         return list(zip(self.weights, [where for where, _ in self.all], away, pulled, strict=True))

@@ -1,11 +1,11 @@
 """Filters: updates by a range, for many filters at once, and error-state filters with inertial readings.
 
-Filters differ in the error of a range that they assume. All update along the line of sight: mean and covariance of the
-state follow from the mean and variance of the noise in an innovation (moments of the posterior for Gaussian noise and
-state), by a gate or by a mixture of errors. A diverged filter restarts from ranges alone (`multilaterate`).
+Filters differ in the assumed error of a range. All update along the line of sight: mean and covariance of the state
+follow from the mean and variance of the noise in an innovation (moments of the posterior for Gaussian noise and state),
+by a gate or by a mixture of errors. A diverged filter restarts from ranges alone (`multilaterate`).
 
 The error-state Kalman filter (Solà 2017, sections 5 to 7) has bodies in the frame of a reference (`RelativeFilter`).
-One body in a room is a case of it (`InertialFilter`): a room is a reference whose readings are those of rest.
+One body in a room is a special case (`InertialFilter`): a room is a reference with the readings of a body at rest.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ def multilaterate(
 ) -> Fix:
     """Return the position from ranges (n,) to anchors (n, 3), by a Cauchy loss from nine starts.
 
-    Instead of a distance a measurement may be the sum of several, with signs (n, k) to anchors (n, k, 3). Errors beyond
-    15 cm count less: reflections are longer. `spread_m` is a further error of each range: its lever arm, or motion of
-    the body. A `height_m` above the world's zero counts as a measurement with a standard deviation of 30 cm.
+    A measurement may also be a sum of several distances, with signs (n, k) to anchors (n, k, 3). Errors beyond 15 cm
+    have less weight, because reflections are longer. `spread_m` is a further error of each range: its lever arm, or
+    motion of the body. A `height_m` above the world's zero counts as a measurement with a standard deviation of 30 cm.
     """
     scale = float(np.hypot(0.15, spread_m))
 
@@ -62,7 +62,7 @@ def multilaterate(
     starts = [middle, *(middle + 0.4 * reach * np.array(signs) for signs in product((-1, 1), repeat=3))]
     found = min((least_squares(misfit, start, loss="cauchy") for start in starts), key=lambda one: float(one.cost))
     slopes = np.asarray(found.jac, dtype=np.float64)
-    # A direction that ranges leave open counts as known to 30 m, about the size of a hall.
+    # A direction that ranges do not determine has a standard deviation of 30 m, about the size of a hall.
     return Fix(np.asarray(found.x), np.asarray(np.linalg.inv(slopes.T @ slopes + 1e-3 * np.eye(3))))
 
 
@@ -75,7 +75,7 @@ BODY: Final = 15
 P, V, A, G, F = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 
 REST: Final = np.array([0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY_M_S2])
-"""What an IMU without errors reads that rests in a room: angular velocity and specific force."""
+"""Readings of an IMU without errors at rest in a room: angular velocity and specific force."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,7 +112,7 @@ IMUS: Final = {
         force=3e-4, gyro=1.7e-5, force_bias=5e-5, gyro_bias=1.7e-6, force_start=0.01, gyro_start=8.7e-5
     ),
 }
-"""Noise by grade of IMU: a consumer's that vibrates, and those of data sheets, as a scenario's `imu.grade` has them."""
+"""Noise by grade of IMU, as in a scenario's `imu.grade`: a consumer IMU that vibrates, and values of data sheets."""
 
 
 class GaussianFilters:
@@ -131,7 +131,7 @@ class GaussianFilters:
         np.einsum("...ii->...i", self.covariance)[..., states] += variance
 
     def append(self, delays: DelayStates) -> slice:
-        """Append states of delays, and return which these are: shared errors in metres, which do not decay."""
+        """Append states of delays, and return their indices. They are shared errors in metres that do not decay."""
         size, count = self.state.shape[-1], len(delays.tags)
         self.state = np.concatenate([self.state, np.zeros((*self.state.shape[:-1], count))], axis=-1)
         around = [(0, 0)] * (self.covariance.ndim - 2) + [(0, count)] * 2
@@ -145,14 +145,14 @@ class GaussianFilters:
         self.add_variance(self.changes, self.delays.walk_m**2 * dt)
 
     def delays_at(self, filter_: tuple[int, ...], delays: DelayStates, *, drift: Any) -> dict[int, tuple[float, float]]:
-        """Return the delays that one of the filters estimates as its states (`DelayStates.estimates`), or those of the
-        calibration if its delays do not `drift`."""
+        """Return the delays that one of the filters estimates as states (`DelayStates.estimates`), or the calibration's
+        delays if its delays do not `drift`."""
         if not (delays.tags and drift):
             return delays.estimates()
         return delays.estimates(self.state[filter_][self.changes], self.covariance[filter_][self.changes, self.changes])
 
     def decay(self, kept: Floats) -> None:
-        """Let shared errors decay to shares `kept` (..., states) of what they were, at the same standard deviation."""
+        """Let shared errors decay to shares `kept` (..., states) of their values, with constant standard deviation."""
         others = slice(self.known, self.known + kept.shape[-1])
         self.state[..., others] *= kept
         self.covariance[..., others, :] *= kept[..., None]
@@ -160,7 +160,7 @@ class GaussianFilters:
         self.add_variance(others, 1 - kept**2)
 
     def forget(self, states: Any, covariance: Floats) -> None:
-        """Take states to be zero, with a covariance, and independent of all others."""
+        """Set states to zero, with a covariance, and independent of all others."""
         self.state[..., states] = 0.0
         self.covariance[..., states, :] = 0.0
         self.covariance[..., states] = 0.0
@@ -175,8 +175,8 @@ class GaussianFilters:
     ) -> WeighedInnovation:
         """Update by scalar measurements with derivatives `row` (..., n) and noise of variance `noise_m2`.
 
-        `innovation` (...) is measured less expected, but for the shared errors, which are linear. `weigh` is given
-        innovations and their variances (...), as `mixture_update`.
+        `innovation` (...) is measured minus expected, without the shared errors, which are linear. `weigh` is a
+        function of innovations and their variances (...), like `mixture_update`.
         """
         innovation = innovation - np.sum((row * self.state)[..., self.known :], axis=-1)
         reach = np.matmul(self.covariance, row[..., None])[..., 0]
@@ -194,8 +194,8 @@ class GaussianFilters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EndPattern:
-    """A pattern over direction at an `end` (0 or 1) of a distance in a measurement; `axes` (3, 3) are those of the
-    antenna's body in the axes of the body that the filter knows."""
+    """A pattern over direction at an `end` (0 or 1) of a distance in a measurement; `axes` (3, 3) are the axes of the
+    antenna's body in the axes of the body that the filter estimates."""
 
     pattern: Pattern
     distance: int
@@ -208,7 +208,7 @@ def end_patterns(
 ) -> list[list[EndPattern]]:
     """Return the patterns of measurements (n,) of distances between tags `ends` (n, k, 2) with a `sign` (n, k).
 
-    `axes` are those of tags whose bodies the filter does not turn.
+    `axes` are the axes of tags whose bodies the filter does not turn.
     """
     found: list[list[EndPattern]] = [[] for _ in ends]
     for one in calibration.patterns:
@@ -219,7 +219,9 @@ def end_patterns(
 
 
 def without_directions(ranges: Ranges) -> Ranges:
-    """Return ranges without the directions by true poses, because filters use those by their own estimates."""
+    """Return ranges without the directions by true poses, because filters compute directions from their own
+    estimates.
+    """
     return replace(ranges, toward=np.full_like(ranges.toward, np.nan))
 
 
@@ -231,10 +233,10 @@ class RelativeFilter(GaussianFilters):
 
         C' = C [w]x - [w0]x C,  p' = v - w0 x p,  v' = C f - f0 - w0 x v
 
-    Gravity cancels (Shalaby et al. 2023, arXiv 2304.03837). No state says where the team is as a whole: what distances
-    between bodies cannot tell is no state, so no linearization can seem to tell it (Huang et al. 2011, Autonomous
-    Robots 30). Errors of attitudes are in the axes of the body. States: `BODY` of each body, the biases of a moving
-    reference, and others, whose meaning is the caller's.
+    Gravity cancels (Shalaby et al. 2023, arXiv 2304.03837). There is no state for the place of the whole team:
+    distances between bodies do not determine it, and as a state it would seem determined by errors of linearization
+    (Huang et al. 2011, Autonomous Robots 30). Errors of attitudes are in the axes of the body. States: `BODY` of each
+    body, the biases of a moving reference, and others that the caller defines.
     """
 
     def __init__(
@@ -243,7 +245,8 @@ class RelativeFilter(GaussianFilters):
         """Start at places (filters, bodies, 3) with attitudes (filters, bodies, 3, 3), and standard deviations."""
         count, self.bodies = attitudes.shape[:2]
         self.noise = noise
-        # Attitude errors move into the attitude, so that part of the state stays zero. The last body is the reference.
+        # Attitude errors are moved into the attitude, so this part of the state stays zero. The last body is the
+        # reference.
         self.attitude = np.concatenate([attitudes, np.tile(np.eye(3), (count, 1, 1, 1))], axis=1)
         covariance = np.tile(np.diag(spread**2), (count, 1, 1))
         super().__init__(np.zeros((count, len(spread))), covariance, BODY * self.bodies + 6 * moving)
@@ -260,7 +263,7 @@ class RelativeFilter(GaussianFilters):
         moving = fixed.start < fixed.stop
         still = reference - (self.state[:, fixed] if moving else 0.0 * self.state[:, :6])
         turn, pull, rate = readings[:, :3] - own[..., G], readings[:, 3:] - own[..., F], still[:, None, :3]
-        # Forces count in the attitude at the middle of the step.
+        # Forces are rotated by the attitude at the middle of the step.
         middle, back, half = turned_by(turn * (dt / 2)), turned_by(-rate * dt), turned_by(rate * (dt / 2))
         pull, attitude = np.einsum("fbij,fbj->fbi", middle, pull), self.attitude[:, :-1]
         force = np.einsum("fbij,fbj->fbi", attitude, pull) - np.einsum("fbij,fbj->fbi", half, still[:, None, 3:])
@@ -290,14 +293,15 @@ class RelativeFilter(GaussianFilters):
         known[:] = known @ step.transpose(0, 2, 1)
         known[:, range(self.known), range(self.known)] += q
         if moving:
-            # The noise of the reference's readings moves all bodies at once.
+            # The noise of the reference's readings is common to all bodies.
             shared = step[:, : fixed.start, fixed] * np.repeat([noise.gyro, noise.force], 3) / np.sqrt(dt)
             self.covariance[:, : fixed.start, : fixed.start] += shared @ shared.transpose(0, 2, 1)
         self.covariance = (self.covariance + self.covariance.transpose(0, 2, 1)) / 2
 
     def distances(self, bodies: Ints, arm_m: Floats, sign: Floats) -> tuple[Floats, Floats, Floats]:
         """Return expected sums of distances (filters,) with signs (k,), their derivatives by the states (filters,
-        states), and standard deviations (filters, k) of what in the distances is not linear in errors of the state.
+        states), and standard deviations (filters, k) of the parts of distances that are not linear in errors of the
+        state.
 
         Distances are between points `arm_m` (k, 2, 3) of `bodies` (k, 2); the number after the last is the reference.
         Means and standard deviations have the terms of second order (Bar-Shalom, Li and Kirubarajan 2001, section
@@ -327,9 +331,9 @@ class RelativeFilter(GaussianFilters):
         return np.asarray(places[:, bodies] + np.einsum("fkeij,kej->fkei", self.attitude[:, bodies], arm_m))
 
     def longer_m(self, bodies: Ints, arm_m: Floats, sign: Floats, patterns: Iterable[EndPattern]) -> Floats:
-        """Return by how much patterns make a sum of distances longer (filters,), by the estimated poses.
+        """Return the amount (filters,) by which patterns lengthen a sum of distances, for the estimated poses.
 
-        Arguments are those of `distances`. What errors of the poses change of it is left out.
+        Arguments are those of `distances`. The effect of pose errors on it is neglected.
         """
         longer = np.zeros(len(self.state))
         for one in patterns:
@@ -354,8 +358,8 @@ of one exchange share, in units of its standard deviation. Changes of delays fol
 class InertialFilter(RelativeFilter):
     """One body in a room, with several headings at once; updates by ranges to points of the room, and by heights.
 
-    Without an IMU the body is taken to be level, and its velocity wanders. With delays as states each heading is there
-    twice: with fixed delays, and with delays that `drift` (filters,).
+    Without an IMU the body is assumed to be level, and its velocity is a random walk. With delays as states each
+    heading has two filters: with fixed delays, and with delays that `drift` (filters,).
     """
 
     def __init__(
@@ -373,7 +377,7 @@ class InertialFilter(RelativeFilter):
         self.drift = np.repeat([False, True], [count, count if delays.tags else 0])
         self.inertial, self.likelihood = inertial, np.zeros(len(self.drift))
         if inertial:
-            # Headings are those of a grid; other standard deviations are those of consumer sensors.
+            # Headings are a grid; other standard deviations are typical of consumer sensors.
             spread[A], spread[G], spread[F] = (0.3, 0.3, np.pi / count), noise.gyro_start, noise.force_start
         else:
             noise = replace(noise, force=noise.acceleration, gyro=0.0, gyro_bias=0.0, force_bias=0.0)
@@ -395,7 +399,7 @@ class InertialFilter(RelativeFilter):
         self.wander(dt)
 
     def begin_exchange(self) -> None:
-        """Begin another exchange, whose measurements share another error."""
+        """Begin another exchange, whose measurements share a new error."""
         self.forget(E, np.ones(1))
 
     def update_range(
@@ -412,13 +416,13 @@ class InertialFilter(RelativeFilter):
         """Update by a sum of distances with a `sign` (k,) to anchors (k, 3): one in a range, two in a difference.
 
         `shared` are the standard deviation in metres of the error that measurements of an exchange share, and the
-        derivatives by delays, where these are states. `patterns` have the body at end 0. Returns the update.
+        derivatives by delays, where these are states. In `patterns` the body is at end 0. Returns the update.
         """
         points = np.stack([np.tile(arm_m if self.inertial else arm_m * (0.0, 0.0, 1.0), (len(sign), 1)), anchor_m], 1)
         bodies = np.tile([0, 1], (len(sign), 1))
         expected, row, bent_m = self.distances(bodies, points, sign)
         if not self.inertial:
-            # Heading is unknown: a lever arm may point anywhere, and the body's pattern, too.
+            # The heading is unknown, and so are the directions of lever arm and pattern.
             noise_m = float(np.hypot(noise_m, np.linalg.norm(row[0, P]) * np.hypot(arm_m[0], arm_m[1]) / np.sqrt(2)))
             noise_m = math.hypot(noise_m, *(one.pattern.rms_m for one in patterns if one.end == 0))
             patterns = [one for one in patterns if one.end]

@@ -1,8 +1,8 @@
 """Localization with and without a calibration: each body is tracked from its ranges to the others.
 
 Four filters use the same ranges and the same velocity noise: raw and calibrated ranges with fixed variances, calibrated
-ranges with the variance of the sigma curve, and calibrated ranges with the whole error model, that is reflections and
-what differs between flights (`calib.evaluation.tracking`). `calib.evaluation.onboard` needs no motion capture.
+ranges with the variance of the sigma curve, and calibrated ranges with the whole error model, i.e. reflections and
+offsets that differ between flights (`calib.evaluation.tracking`). `calib.evaluation.onboard` needs no motion capture.
 """
 
 from __future__ import annotations
@@ -75,12 +75,12 @@ class Localization:
 
     @property
     def label(self) -> str:
-        """The body, as names of files have it."""
+        """The name of the body in names of files."""
         return self.body
 
     @property
     def delays(self) -> Mapping[int, tuple[float, float]]:
-        """The delays at the end and their standard deviations, by tag in ns, empty where they are no states."""
+        """The delays at the end and their standard deviations, by tag in ns, empty if delays are not states."""
         return self.tracks["online"].delays if "online" in self.tracks else {}
 
     def trajectories(self) -> dict[str, Trajectory]:
@@ -96,7 +96,7 @@ class Localization:
 
 @dataclass(frozen=True, slots=True)
 class LocalizationModel:
-    """A motion model: its settings, the function that localizes by it, and what is printed of its results.
+    """A motion model: its settings, its function for localization, and the printed form of its results.
 
     `localize` takes data, a calibration and settings, and returns a list; `table` makes JSON of that list, and `text`
     lines of the list and the settings.
@@ -121,7 +121,7 @@ def localize(
 
     `data` is the path of a recording, an open `Recording`, or anything with `exchanges`, `poses` and `tags`. The fixed
     variances are the best ones on the flight `training`; without it the variances of the fitted errors, which the
-    calibration contains; never those of the flight itself, which a filter cannot know. Raises the errors of
+    calibration contains; never those of the flight itself, which are unknown during a flight. Raises the errors of
     `Calibration.apply`, and `UnanswerableError` if no body moves or the recording has no poses.
 
     >>> import calib
@@ -163,7 +163,7 @@ def localize(
 
 
 def _flight_for(data: Data | Flight, calibration: Calibration, settings: Settings) -> Flight:
-    """Return a flight with what `settings` use of it."""
+    """Return the part of a flight that `settings` use."""
     flight = (
         data if isinstance(data, Flight) else load_flight(data, need_power=calibration.needs_power, use=settings.use)
     )
@@ -172,11 +172,11 @@ def _flight_for(data: Data | Flight, calibration: Calibration, settings: Setting
 
 @dataclass(frozen=True, slots=True)
 class MeasuredReceptions:
-    """What errors of n measurements are made of, raw and corrected, in metres.
+    """The components of the errors of n measurements, raw and corrected, in metres.
 
-    They are `sign` (n, k) times those of `parts`, ranges or receptions with an independent variance of `gain` (n, k)
-    times that of a range, and what measurements of an exchange share, with a standard deviation of `common_m` (n,)
-    times that of a range.
+    An error is the sum of `sign` (n, k) times the errors of `parts` (ranges, or receptions with an independent variance
+    of `gain` (n, k) times the variance of a range) and a common error of the measurements of an exchange, with a
+    standard deviation of `common_m` (n,) times that of a range.
     """
 
     raw_m: Floats
@@ -188,9 +188,9 @@ class MeasuredReceptions:
 
     @classmethod
     def of(cls, ranges: Ranges, calibration: Calibration) -> MeasuredReceptions:
-        """Return those of ranges, and then of their arrivals."""
+        """Return the components for ranges, and then for their arrivals."""
         applied, sign, none = calibration.apply(ranges), distances_in(ranges)[1], np.zeros(len(ranges))
-        # Without stamps a difference has 5 times the variance of a range, but where the fit was to differences alone.
+        # Without stamps a difference has 5 times the variance of a range, unless only differences were fitted.
         whole = [1.0, 0.0] if calibration.provenance.get("exchanges") == 0 else [2.5, 2.5]
         own = np.where(ranges.differences[:, None], whole[: sign.shape[1]], sign[: len(ranges)])
         if ranges.arrivals is None:
@@ -206,16 +206,18 @@ class MeasuredReceptions:
         )
 
     def own_m(self, std_m: Floats | float) -> Floats:
-        """Return the standard deviation of own errors (n,), where those of ranges (n, k) like the parts have this."""
+        """Return the standard deviation of independent errors (n,) for given deviations (n, k) of ranges like the
+        parts.
+        """
         return np.asarray(np.sqrt(np.sum(self.gain * np.square(std_m), axis=1)))
 
     def fixed(self, measured_m: Floats, std_m: float) -> FilterRanges:
-        """Return what a filter measures that takes all ranges to have the same standard deviation."""
+        """Return the measurements for a filter that assumes one standard deviation for all ranges."""
         common_m = np.where(self.common_m > 0, std_m, 0.0)
         return FilterRanges(measured_m, self.own_m(std_m), common_m, np.zeros_like(self.sign))
 
     def robust(self, calibration: Calibration) -> tuple[FilterRanges, Floats, RangeErrors]:
-        """Return what a filter measures that knows errors, the noise of ranges like the parts (n, k), and errors."""
+        """Return the measurements for a filter with an error model and the noise of ranges like the parts (n, k)."""
         noises, kinds = zip(*(range_errors(calibration, part) for part in self.parts), strict=True)
         noise, shares, detours = (
             np.column_stack(some) for some in (noises, [one.share for one in kinds], [one.detour_m for one in kinds])
@@ -229,10 +231,10 @@ class MeasuredReceptions:
 def filter_ranges(
     ranges: Ranges, calibration: Calibration, fixed: FixedStd, *, online: bool = False
 ) -> dict[str, FilterRanges]:
-    """Return what each of `FILTERS` measures by ranges and then by arrivals.
+    """Return the measurements of each of `FILTERS`: ranges, then arrivals.
 
-    The robust one needs an error model, and has a rival with what differs between flights by pair. The one with
-    `online` delays is the robust one, or that with a variance.
+    The robust filter needs an error model, and has a rival with offsets of pairs that differ between flights. The
+    filter with `online` delays is the robust one, or the one with a variance.
     """
     known, model = MeasuredReceptions.of(ranges, calibration), calibration.errors
     corrected, sign, common = known.corrected_m, known.sign, known.common_m
@@ -247,14 +249,14 @@ def filter_ranges(
         return found | with_delays(found["variance"], ranges, calibration, online=online)
     found["robust"], noise, errors = known.robust(calibration)
     if lasting := model.lasting:
-        # Receptions have independent noise: only reflections last in differences of arrival. A gate lets longer ones
-        # pass there, because these have five times the variance of ranges.
+        # Receptions have independent noise: only reflections last in differences of arrival. A gate accepts longer ones
+        # there, because differences have five times the variance of ranges.
         heard = np.abs(sign).sum(axis=1) > 1
         own, shared = np.where(heard, [[1.0], [0.0]], np.sqrt([[lasting.own_variance], [lasting.lasting_variance]]))
         gate_m = np.sqrt(GATE) * np.hypot(known.own_m(sigma), common) * heard
         detours_m2 = errors.share * model.square_below_m2(errors.detour_m, gate_m[:, None])
         centred = corrected - lasting.mean * np.sum(sign * sigma, axis=1)
-        # The mixture contains reflections within the gate, so the total variance is that of the noise.
+        # The mixture contains reflections within the gate, so the total variance is the variance of the noise.
         units = np.ones(len(sign)), np.hypot(own, shared)
         both = centred, found["robust"].measured_m
         for name, one, std, unit in zip(("variance", "robust"), both, (sigma, noise), units, strict=True):
@@ -275,7 +277,7 @@ def filter_ranges(
 def with_delays(
     measured: FilterRanges, ranges: Ranges, calibration: Calibration, *, online: bool
 ) -> dict[str, FilterRanges]:
-    """Return what a filter measures of ranges and then of arrivals, as "online" with delays as states."""
+    """Return the measurements of a filter, ranges and then arrivals, as "online" with delays as states."""
     if not online:
         return {}
     states = DelayStates.of(calibration, ranges.tags())
@@ -285,10 +287,10 @@ def with_delays(
 
 
 def fixed_std(calibration: Calibration, settings: Settings, training: Data | Flight | None = None) -> FixedStd:
-    """Return the fixed standard deviations of raw and calibrated ranges, from what is known before the flight.
+    """Return the fixed standard deviations of raw and calibrated ranges, from data before the flight.
 
     In this order: the given one; those with the smallest RMSE on a training flight; those of the errors that the
-    calibration was fitted to; for old calibrations its sigma at the median power.
+    calibration was fitted to; for old calibrations sigma at the median power.
     """
     if settings.fixed_std_m is not None:
         return FixedStd(dict.fromkeys(("raw", "calibrated"), settings.fixed_std_m), "given")
@@ -321,8 +323,8 @@ class LocalizationSummary:
     `rmse_m` are means over seeds, too, `spread_m` standard deviations over seeds of the mean over bodies (NaN of one
     seed). `nis` is over accepted ranges, of which a gate at 99.9 % leaves 0.99; `nees` should be 3, a state's size.
     `nis_bounds` and `nees_bounds` hold 95 % of such means if the filter is consistent: chi-square over the number of
-    independent values (Bar-Shalom, Li and Kirubarajan 2001, section 5.4), where a NEES counts once in the time that the
-    error takes to forget. `nis_inside` and `nees_inside` are the shares of single values within their 95 % bounds.
+    independent values (Bar-Shalom, Li and Kirubarajan 2001, section 5.4), with one NEES per correlation time of the
+    error. `nis_inside` and `nees_inside` are the shares of single values within their 95 % bounds.
     """
 
     rmse_m: dict[str, float]
@@ -343,7 +345,7 @@ def rmse_rows(
 ) -> list[list[str]]:
     """Return a row for each body of the RMSE by filter, and rows of their mean, its spread, and its reduction.
 
-    `spread` is the title of the spread, which is left out of a single seed.
+    `spread` is the title of the spread, which is omitted for a single seed.
     """
     names, several = list(total.rmse_m), len(found[0].rmse_m["raw"]) > 1
     numbers = [
@@ -393,7 +395,7 @@ def summarize(found: list[Localization]) -> LocalizationSummary:
 
 
 def consistency(tracks: Sequence[Track]) -> tuple[float, tuple[float, float], float]:
-    """Return the mean NEES of tracks, 95 % bounds of such a mean, and the share of single ones in their 95 % bounds.
+    """Return the mean NEES of tracks, its 95 % bounds, and the share of single values within their 95 % bounds.
 
     Without truth they are NaN.
     """
@@ -423,7 +425,7 @@ def _independent(values: Floats) -> float:
     The sum ends where the autocorrelation first falls below a twentieth.
     """
     centred = values - values.mean()
-    # Twice as long with zeros: a spectrum's correlation is circular.
+    # Zeros double the length, because the correlation by spectra is circular.
     correlation = np.fft.irfft(np.abs(np.fft.rfft(centred, 2 * len(centred))) ** 2)[: len(centred)]
     correlation = correlation / max(float(correlation[0]), 1e-300)
     end = int(np.argmax(np.append(correlation, 0.0) < 0.05))
@@ -481,7 +483,7 @@ def localization_json(found: list[Localization]) -> dict[str, Any]:
 
 def delay_lines(title: str, track: Track | None) -> list[str]:
     """Return a line with delays at the end of a track and 95 % intervals, and one with the probability that they drift;
-    none where delays are no states."""
+    none if delays are not states."""
     if track is None or not track.delays:
         return []
     each = ", ".join(f"{tag}: {delay:+.3f} {interval(std, 3)}" for tag, (delay, std) in track.delays.items())
@@ -493,8 +495,8 @@ def delay_lines(title: str, track: Track | None) -> list[str]:
 
 
 def offset_lines(title: str, track: Track | None) -> list[str]:
-    """Return a line where it is likelier than not that pairs have constants in a flight which the calibration's had
-    not."""
+    """Return a line if it is likelier than not that pairs have constants in this flight that the calibration's flight
+    did not have."""
     if track is None or not len(track.offsets) or track.offsets[-1] < 0.5:
         return []
     return [
@@ -504,8 +506,8 @@ def offset_lines(title: str, track: Track | None) -> list[str]:
 
 
 def delays_json(track: Track | None) -> dict[str, Any]:
-    """Return delays at the end, and the mean probability that they drift, as JSON has them; nothing where they are no
-    states."""
+    """Return delays at the end, and the mean probability that they drift, for JSON; nothing if delays are
+    not states."""
     if track is None or not track.delays:
         return {}
     rows = {str(tag): {"delay_ns": one, "std_ns": for_json(std)} for tag, (one, std) in track.delays.items()}

@@ -1,4 +1,4 @@
-"""Models of ranges that filters assume: what each measures, with which errors, and averages over several models."""
+"""Models of ranges that filters assume: measurements with their errors, and averages over several models."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from uwblink.arrays import Bools, Floats, Ints
 
 @dataclass(frozen=True, slots=True)
 class FilterRanges:
-    """What a filter measures (n,), the standard deviation of each measurement's own error, and its error model, if any.
+    """The measurements (n,) of a filter, the standard deviation of each one's independent error, and its error model,
+    if any.
 
-    Ranges of a pair share an error with a standard deviation of `shared_m`, which lasts for `lasting_s`: (n, k) by the
+    Ranges of a pair share an error that lasts for `lasting_s`, with a standard deviation of `shared_m` (n, k): by the
     distances in a measurement, with their signs. Reflections last for `renewal_s` (`calib.online.Reflections`).
     Distances between a pair of tags are off by a constant with a standard deviation of `offset_m`. Measurements of an
     exchange share an error of `common_m` (n,). Where delays are states, `delay_slopes` (n, tags) are the derivatives by
-    them. What counts is the average over a model and as many `rivals` before it (`ModelAverage`); a model that is not
+    them. The result is the average over a model and the `rivals` models before it (`ModelAverage`); a model that is not
     `shown` is only a rival.
     """
 
@@ -47,8 +48,9 @@ class FilterRanges:
 
 
 def side_by_side(filters: Sequence[FilterRanges]) -> Iterator[Floats]:
-    """Yield what filters measure, the standard deviations of own errors and of those of an exchange (n, filters), and
-    of errors that pairs share (n, filters, k), and derivatives by states of delays (n, filters, tags)."""
+    """Yield the measurements of filters, the standard deviations of independent errors and of common errors of an
+    exchange (n, filters), of errors that pairs share (n, filters, k), and derivatives by states of delays (n, filters,
+    tags)."""
     for name in ("measured_m", "std_m", "common_m", "shared_m"):
         yield np.stack([getattr(one, name) for one in filters], axis=1)
     fixed = np.zeros((len(filters[0].measured_m), len(delay_states(filters).tags)))
@@ -56,23 +58,23 @@ def side_by_side(filters: Sequence[FilterRanges]) -> Iterator[Floats]:
 
 
 def delay_states(filters: Sequence[FilterRanges]) -> DelayStates:
-    """Return the states of delays that some of the filters have, of no tag where none has any."""
+    """Return the states of delays of the filters that have some; states without tags if none has."""
     return next((one.delays for one in filters if one.delays.tags), FIXED_DELAYS)
 
 
 LEAST_ODDS: Final = 1e-3
-"""Least probability of a model over that of the likeliest, so that delays may begin to drift late in a flight."""
+"""Minimum ratio of a model's probability to the largest one, so that delays may begin to drift late in a flight."""
 
 
 class ModelAverage:
     """Averages over filters and their rivals by probability: one for each filter that is `shown`.
 
-    Probabilities follow from the densities of innovations, and are equal before (Bar-Shalom, Li and Kirubarajan 2001,
+    Probabilities follow from the densities of innovations, and are equal at first (Bar-Shalom, Li and Kirubarajan 2001,
     section 11.6.2). Arrays of filters are (filters, ...), averages (shown, ...).
     """
 
     def __init__(self, known: Sequence[FilterRanges], shape: tuple[int, ...] = ()) -> None:
-        """Begin with no innovation of filters (filters, *shape)."""
+        """Begin without innovations of filters (filters, *shape)."""
         self.shown = [f for f, one in enumerate(known) if one.shown]
         rivals = np.array([[0 <= f - k <= known[f].rivals for k in range(len(known))] for f in self.shown])
         self.least = np.where(rivals, np.log(LEAST_ODDS), -np.inf).reshape(*rivals.shape, *(1 for _ in shape))
@@ -82,7 +84,7 @@ class ModelAverage:
         self.learn(np.zeros((len(known), *shape)))
 
     def learn(self, log_density: Floats) -> None:
-        """Learn from the densities of innovations (filters, ...)."""
+        """Update probabilities with the densities of innovations (filters, ...)."""
         log_odds = self.log_odds + log_density
         self.log_odds = np.maximum(log_odds - log_odds.max(axis=1, keepdims=True), self.least)
         odds = np.exp(self.log_odds)
@@ -95,7 +97,7 @@ class ModelAverage:
     def moments(self, state: Floats, covariance: Floats) -> tuple[Floats, Floats]:
         """Return means (shown, ..., n) and covariances (shown, ..., n, n) of states with covariances.
 
-        States are (filters, ..., n), or (shown, filters, ..., n) where they differ by average.
+        States are (filters, ..., n), or (shown, filters, ..., n) if they differ by average.
         """
         state = state if state.ndim > covariance.ndim - 1 else state[None]
         mean = np.einsum(
@@ -114,17 +116,17 @@ class ModelAverage:
 
 
 class FilterBank:
-    """Filters at once on the same measurements (n,), and what their averages come to.
+    """Filters with the same measurements (n,), and their averages.
 
-    `running` are filters (filters, ...), to whose states those of delays are appended (`delays`). `uses` (n, filters)
-    are the measurements of each, of `pairs` pairs of tags. They update by a gate, or by an error model with reflections
-    that last. `common`, `shared` and `slopes` are those of `side_by_side`; `measured` is (n, filters, ...).
+    `running` are filters (filters, ...); states of delays are appended to theirs (`delays`). `uses` (n, filters) are
+    the measurements that each uses, from `pairs` pairs of tags. They update by a gate, or by an error model with
+    reflections that last. `common`, `shared` and `slopes` are from `side_by_side`; `measured` is (n, filters, ...).
     """
 
     def __init__(
         self, known: Sequence[FilterRanges], running: GaussianFilters, gate: float, uses: Bools, pairs: int
     ) -> None:
-        """Begin with nothing known of errors."""
+        """Begin without information on errors."""
         self.known, self.running, shape = known, running, running.state.shape[1:-1]
         measured, std, self.common, self.shared, self.slopes = side_by_side(known)
         around = (..., *(None for _ in shape))
@@ -132,7 +134,7 @@ class FilterBank:
             np.broadcast_to(one[around], (*one.shape, *shape)) for one in (measured, std**2, uses)
         )
         self.delays = running.append(delay_states(known))
-        # Filters with an error model have the same, that of a calibration.
+        # All filters with an error model have the calibration's.
         self.gate, self.average = gate, ModelAverage(known, shape)
         self.robust = [f for f, one in enumerate(known) if one.errors is not None]
         first = known[self.robust[0]] if self.robust else known[0]
@@ -142,7 +144,7 @@ class FilterBank:
     def observe(self, row: int, slopes: Floats, expected: Floats, pair: Ints) -> WeighedInnovation:
         """Update the filters that use measurement `row` between pairs (k,); return the updates of all.
 
-        `expected` (filters, ...) is what they expect of it, with derivatives `slopes` (filters, ..., states).
+        `expected` (filters, ...) is the expected measurement, with derivatives `slopes` (filters, ..., states).
         """
         used, innovation = self.uses[row], self.measured[row] - expected
         weigh = partial(self._weigh, row, pair)
@@ -163,17 +165,17 @@ class FilterBank:
         return update
 
     def pass_time(self, dt: float) -> None:
-        """Let delays drift, and reflections be forgotten, for `dt` seconds."""
+        """Let delays drift, and the memory of reflections decay, for `dt` seconds."""
         self.running.wander(dt)
         self.reflections.decay(dt)
 
     def forget_reflections(self, lost: tuple[int, ...]) -> None:
-        """Forget what a filter that begins anew knew of reflections."""
+        """Forget the reflections of a filter that restarts."""
         if lost[0] in self.robust:
             self.reflections.lasting[self.robust.index(lost[0]), *lost[1:]] = 0.0
 
     def outcome(self, *which: Any) -> dict[str, Any]:
-        """Return fields of the `Track` of one average: of the measurements that it uses, and of delays at the end."""
+        """Return fields of the `Track` of one average: for the measurements that it uses, and delays at the end."""
         f, (changes_m, covariance) = self.average.shown[which[0]], self.average.delays(self.running)
         nis, accepted, offsets, drifts = self.judged[:, self.uses[(slice(None), f, *which[1:])]][(..., *which)]
         states = self.known[f].delays

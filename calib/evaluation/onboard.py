@@ -1,7 +1,7 @@
 """Localization without motion capture: ranges to fixed anchors, optionally an IMU and a height sensor.
 
-With `OnboardSettings(use="receptions")` differences of arrival are measurements, too: what the body overhears of
-anchors, and what anchors overhear of it.
+With `OnboardSettings(use="receptions")` differences of arrival are measurements, too: frames of anchors that the body
+overhears, and frames of the body that anchors overhear.
 
 The first ranges give the start (`multilaterate`), gravity gives the tilt, and several headings are tried in parallel;
 the likeliest is reported. If it does not explain its ranges, the filter restarts from them. Poses of the
@@ -54,17 +54,18 @@ MIN_ANCHORS: Final = 3
 """
 
 MIN_RANGES_PER_FIX: Final = 6
-"""Two for each coordinate, so that the median of their errors excludes a reflected one."""
+"""Two ranges for each coordinate, so that the median of their errors excludes a reflected one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OnboardSettings(CheckedSettings):
     """How a body is localized: `model` is "imu" or "constant-velocity", `height` whether its height sensor is used.
 
-    `start_m` is where it begins, with a standard deviation of `start_std_m` an axis, instead of where its first ranges
-    say; a wrong one is left after `reopen_s`, or as many ranges as a fix takes. `headings` are tried at once;
-    inertial readings are averaged to `rate_hz`. `speed_m_s` is how fast it may move at a start. `use` is "exchanges",
-    or "receptions", with differences of arrival. With `online` each body has one more track, with delays as states.
+    `start_m` is the start position, with a standard deviation of `start_std_m` per axis, instead of a fix by its first
+    ranges; a wrong start is replaced after `reopen_s`, or the number of ranges of a fix. `headings` are tried in
+    parallel; inertial readings are averaged to `rate_hz`. `speed_m_s` is the largest speed at a start. `use` is
+    "exchanges", or "receptions", with differences of arrival. With `online` each body has one more track, with delays
+    as states.
 
     >>> import calib
     >>> calib.OnboardSettings(start_m=(0.0, 0.0, 1.0)).model
@@ -107,12 +108,12 @@ class OnboardTrack(Track):
 
     @property
     def label(self) -> str:
-        """The body and the model, as names of files have them."""
+        """The body and the model in names of files."""
         return f"{self.body}-{self.model}{'-online' if self.delays else ''}"
 
     @property
     def title(self) -> str:
-        """The recording and the body, and whether delays were states, in words."""
+        """The recording, the body, and whether delays were states, in words."""
         return f"{self.source} {self.body}{', delays online' if self.delays else ''}"
 
     def __repr__(self) -> str:
@@ -144,12 +145,13 @@ def localize_onboard(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Readings(Measurements):
-    """One body's: measurements (n,), inertial readings, heights.
+    """Readings of one body: measurements (n,), inertial readings, heights.
 
-    Of the k distances in a measurement `sign` (n, k) is 0 for those between anchors, which are taken off what is
+    Of the k distances in a measurement `sign` (n, k) is 0 for distances between anchors, which are subtracted from
     `measured`; the others are from the antenna at `arm_m` (n, 3) to `anchor_m` (n, k, 3). Times are seconds since
     `began_ns`, the first exchange. `imu` are angular velocities in rad/s and specific forces in m/s^2 (m, 6) in the
-    axes of the body. `patterns` are those of measurements, the body at end 0. `truth` are its poses, or None.
+    axes of the body. `patterns` are the patterns in measurements, with the body at end 0. `truth` are its poses, or
+    None.
     """
 
     body: str
@@ -168,8 +170,8 @@ class _Readings(Measurements):
 
 
 def _readings(data: Data, calibration: Calibration, settings: OnboardSettings) -> list[_Readings]:
-    """Return the readings of every body that is not an anchor and ranges with one, or listens: with fixed delays, and
-    if chosen with delays as states."""
+    """Return the readings of every body other than anchors that ranges with an anchor, or listens: with fixed delays,
+    and if chosen also with delays as states."""
     use = settings.use
     flight = load_flight(data, need_power=calibration.needs_power, need_truth=False, use=use, sensors=("imu", "height"))
     name, (imu, heights) = flight.ranges.source, flight.sensors.values()
@@ -253,18 +255,18 @@ def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilt
                 f"{one.ranges.source}: {one.body} ranges with too few anchors for an initial position; give one"
             )
         fix = _fix(one, np.arange(first + 1), settings)
-    near = np.abs(one.imu_s - float(one.time_s[first])) < 0.25  # s: the first tilt is that of half a second
+    near = np.abs(one.imu_s - float(one.time_s[first])) < 0.25  # s: the first tilt is the mean of half a second
     force = one.imu[near, 3:].mean(axis=0) if near.any() else np.array([0.0, 0.0, GRAVITY_M_S2])
     turned = _attitudes(force, settings.headings) if inertial else np.eye(3)[None]
     delays = one.measured.delays
     found = InertialFilter(fix, turned, settings.noise, inertial=inertial, speed_m_s=settings.speed_m_s, delays=delays)
     if inertial:
-        found.update_gravity(force, 0.7)  # m/s^2: how a body may accelerate while it begins
+        found.update_gravity(force, 0.7)  # m/s^2: acceleration of a body at the start
     return first, found
 
 
 def _determined(one: _Readings, rows: Ints) -> bool:
-    """Return whether some measurements have the anchors of a start: differences alone need one more."""
+    """Return whether some measurements have enough anchors for a start: with only differences one more is needed."""
     used = one.sign[rows] != 0
     anchors = len(np.unique(one.anchor_m[rows][used], axis=0))
     return bool(anchors - (used.sum(axis=1) > 1).all() > MIN_ANCHORS)
@@ -301,7 +303,7 @@ def _events(one: _Readings, settings: OnboardSettings, begin_s: float) -> Iterat
     happens = [(time_s, "step", number) for number, time_s in enumerate(grid.tolist())]
     happens += [(float(one.time_s[row]), "range", row) for row in ranges.tolist()]
     if settings.height:
-        # Ten a second are enough: its offset wanders slowly.
+        # Ten per second are enough: the sensor's offset changes slowly.
         every = np.unique(np.floor(one.height_s * 10), return_index=True)[1]
         rows = every[(one.height_s[every] >= begin_s) & (one.height_s[every] <= end_s)]
         happens += [(float(one.height_s[row]), "height", row) for row in rows.tolist()]
@@ -319,7 +321,7 @@ def mean_readings(time_s: Floats, readings: Floats, edges: Floats) -> Floats:
     inside = np.clip(edges, time_s[0], time_s[-1])
     span = np.diff(inside)[:, None]
     sums = np.diff(curve.antiderivative()(inside), axis=0)
-    # The rounding of a sum is divided by the span.
+    # The rounding error of a sum is divided by the span.
     return np.asarray(np.where(span > 1e-9, sums / np.maximum(span, 1e-9), curve(inside[1:])))
 
 
@@ -331,7 +333,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
     unexplained_s, numbers = 0.0, np.column_stack([known.measured_m, known.std_m]).tolist()
     *_, common, _, slopes = side_by_side([known])
     shared = np.column_stack([common, slopes[:, 0]])
-    # The speed limit counts once a second: velocities are independent after a second.
+    # The speed limit is applied once per second: velocities are independent after a second.
     slow_every = max(round(settings.rate_hz), 1)
     for time_s, kind, number, inertial in _events(one, settings, now):
         if time_s > now:
@@ -350,7 +352,8 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
             more = shared[number], one.patterns[number]
             update = running.update_range(measured, noise_m, one.errors.at(number), *geometry, *more)
             updates.append((now, float(update.nis[best]), bool(update.believed[best]), running.drifts))
-            # As in `tracking.run_filters`, but explained ranges earn no trust: this filter drifts.
+            # As in `tracking.run_filters`, but explained ranges do not extend the time before a restart: this filter
+            # drifts.
             lasted_s = min(now - heard, settings.reopen_s / 2 / MIN_RANGES_PER_FIX)
             unexplained_s = max(unexplained_s + (lasted_s if update.nis[best] > GATE else -lasted_s / 3), 0.0)
             heard, rows = now, _latest(one, number, settings)
@@ -407,7 +410,7 @@ def _latest(one: _Readings, last: int, settings: OnboardSettings) -> Ints:
 
 
 def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
-    """Return a line per body: its RMSE where truth is known."""
+    """Return a line per body: its RMSE if truth is known."""
     lines = [f"{'by ranges to fixed anchors':33s}{'RMSE (m)':>10s}{'median':>9s}{'95 %':>9s}{'own std':>9s}  restarts"]
     for one in found:
         off = np.linalg.norm(one.estimate_m - one.truth_m, axis=1)

@@ -58,15 +58,14 @@ class Stats:
 class ErrorStatistics:
     """A pair, or all pairs: statistics in the three stages, and the chi-square test.
 
-    `rejected` is the share of fully corrected errors whose square exceeds the 95 % quantile of
-    chi-square times sigma squared, `accepted` the statistics of the others. `rejected_raw` is the same share of raw
-    errors with the variance that all of them have, which is what there is without a calibration. `coverage` maps a
-    nominal share of a normal distribution to the share of corrected errors within its bounds.
+    `rejected` is the share of fully corrected errors whose square exceeds the 95 % quantile of chi-square times sigma
+    squared, `accepted` the statistics of the others. `rejected_raw` is the same share of raw errors with their common
+    variance, as without a calibration. `coverage` maps a nominal share of a normal distribution to the share of
+    corrected errors within its bounds.
 
-    With all that errors are made of: `total_mean` and `total_std` are mean and standard deviation of errors, less the
-    mean that is expected of them, over `sigma_total_m` (0 and 1 if right); `inside_95` is the share between the 2.5 and
-    97.5 % quantiles by pair and power, `tail_share` how many of the ranges should be reflected. NaN where the
-    calibration does not say.
+    With reflections: `total_mean` and `total_std` are mean and standard deviation of errors minus their expected mean,
+    divided by `sigma_total_m` (0 and 1 if right); `inside_95` is the share between the 2.5 and 97.5 % quantiles by pair
+    and power, `tail_share` the expected share of reflected ranges. NaN if the calibration does not state them.
     """
 
     raw: Stats
@@ -89,9 +88,9 @@ class PlantedComparison:
 
     Shifts along undetermined splits of the calibration are removed from the delays as well.
 
-    `delay_error_ns` maps tags to fitted less planted delays, `curve_rms_m` is the rms of the bias curves' difference
-    over the ranges inside the fitted power, `correction_rms_m` that of the whole correction of each range; NaN if no
-    curve was planted.
+    `delay_error_ns` maps tags to fitted minus planted delays, `curve_rms_m` is the rms of the bias curves' difference
+    over the ranges inside the fitted power, `correction_rms_m` the rms difference of the whole correction of each
+    range; NaN if no curve was planted.
     """
 
     shift_ns: float
@@ -104,8 +103,8 @@ class PlantedComparison:
 class ErrorSplit:
     """Standard deviations of corrected errors in metres: within a pair and session, and of the constants of these.
 
-    `between_pairs_m` is that between pairs, `between_sessions_m` that of a pair between sessions (NaN with one session
-    or one pair).
+    `between_pairs_m` is the deviation between pairs, `between_sessions_m` of a pair between sessions (NaN with one
+    session or one pair).
     """
 
     within_m: float
@@ -158,7 +157,7 @@ class Evaluation:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `calib evaluate --json` prints; `planted` only where a simulation planted something."""
+        """Return the output of `calib evaluate --json`; `planted` only if a simulation planted values."""
         document: dict[str, Any] = {
             "seen_by_fit": list(self.seen),
             "overall": for_json(asdict(self.overall)),
@@ -186,8 +185,8 @@ def evaluate(data: Data | Iterable[Data], calibration: CalibrationSource) -> Eva
 
     `data` is what `load_ranges` takes: paths of recordings, simulations in memory, `Ranges`, one or several. Errors are
     in metres. Ranges of pairs that the calibration does not determine are left out, with a `LeftOutWarning`; a
-    `DirectionWarning` states the share whose directions are needed and not known. Raises
-    what `load_ranges` and `Calibration.apply` raise.
+    `DirectionWarning` states the share of ranges whose directions are needed but unknown. Raises what `load_ranges` and
+    `Calibration.apply` raise.
 
     >>> import calib
     >>> known = calib.fit(calib.sample_flight()).calibration
@@ -201,7 +200,7 @@ def evaluate(data: Data | Iterable[Data], calibration: CalibrationSource) -> Eva
     applied = calibration.apply(ranges)
     everything = np.ones(len(ranges), dtype=bool)
     inside = _between_quantiles(ranges, applied, calibration)
-    # Older calibrations do not say what they were fitted to.
+    # Older calibrations do not state their fitted recordings.
     known = calibration.provenance.get("recording_ids")
     return Evaluation(
         _group(ranges, applied, everything, inside),
@@ -215,7 +214,7 @@ def evaluate(data: Data | Iterable[Data], calibration: CalibrationSource) -> Eva
 def compare_with_planted(
     ranges: Ranges, applied: CorrectedRanges, calibration: Calibration
 ) -> PlantedComparison | None:
-    """Compare a calibration with what a simulation planted, where the ranges carry it."""
+    """Compare a calibration with the planted values of a simulation, if the ranges contain these."""
     planted = {int(tag): float(delay) for tag, delay in (ranges.planted or {}).get("delays_ns", {}).items()}
     difference = {tag: calibration.delays_ns[tag] - d for tag, d in planted.items() if tag in calibration.delays_ns}
     if not difference:
@@ -254,20 +253,20 @@ def pair_rows(ranges: Ranges) -> dict[str, Bools]:
 
 
 def split_error(ranges: Ranges, error_m: Floats) -> ErrorSplit:
-    """Split errors (n,) into what varies within a pair and session, and between them.
+    """Split errors (n,) into variation within a pair and session, and between pairs and sessions.
 
-    Groups are described by median and robust spread, so that reflections count little. What their medians vary more
-    than chance explains (1.57 s²/n of n errors of spread s) is the variance between (DerSimonian and Laird 1986).
-    Errors that last for seconds count as independent, so short sessions seem to differ. Groups of fewer than 5 ranges
-    are left out.
+    Groups are described by median and robust spread, so that reflections have little weight. The variance between
+    groups is the variance of their medians minus the part that chance explains (1.57 s²/n for n errors of spread s;
+    DerSimonian and Laird 1986). Errors that last for seconds are treated as independent, so short sessions seem to
+    differ. Groups of fewer than 5 ranges are left out.
     """
     pair, count = pairs_of(ranges.initiator, ranges.target).number, int(ranges.session.max(initial=0)) + 1
     codes, group, counts = np.unique(pair * count + ranges.session, return_inverse=True, return_counts=True)
-    told = counts >= 5
-    if not told.any():
+    large = counts >= 5
+    if not large.any():
         return ErrorSplit(within_m=np.nan, between_pairs_m=np.nan, between_sessions_m=np.nan, sessions=0)
-    centre, squares = medians(error_m, group)[told], spreads(error_m, group)[told] ** 2
-    chance, (pairs, sessions) = 1.57 * squares / counts[told], np.divmod(codes[told], count)
+    centre, squares = medians(error_m, group)[large], spreads(error_m, group)[large] ** 2
+    chance, (pairs, sessions) = 1.57 * squares / counts[large], np.divmod(codes[large], count)
     _, number, members = np.unique(pairs, return_inverse=True, return_counts=True)
     centres = np.bincount(number, centre) / members
     freedom = len(pairs) - len(centres)
@@ -276,7 +275,7 @@ def split_error(ranges: Ranges, error_m: Floats) -> ErrorSplit:
     of_centres = (np.nan_to_num(between_sessions) + np.bincount(number, chance) / members) / members
     between_pairs = float(np.var(centres, ddof=1) - np.mean(of_centres)) if len(centres) > 1 else np.nan
     return ErrorSplit(
-        within_m=float(np.sqrt(np.average(squares, weights=counts[told]))),
+        within_m=float(np.sqrt(np.average(squares, weights=counts[large]))),
         between_pairs_m=float(np.sqrt(np.maximum(between_pairs, 0.0))),
         between_sessions_m=float(np.sqrt(between_sessions)),
         sessions=len(np.unique(sessions)),
@@ -300,7 +299,7 @@ def statistics(error_m: Floats) -> Stats:
 
 
 def _between_quantiles(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> Floats:
-    """Return 1 where an error (n,) lies between the quantiles that hold 95 %, else 0; NaN where they are not known."""
+    """Return 1 where an error (n,) lies between the quantiles that hold 95 %, else 0; NaN if they are unknown."""
     if calibration.errors is None:
         return np.full(len(ranges), np.nan)
     low, high = calibration.quantiles(ranges, (0.025, 0.975)).T

@@ -1,9 +1,9 @@
 """Relative poses of a team of robots from ranges, overheard frames and IMUs, without anchors or motion capture.
 
 All robots are estimated together in the frame of one of them (`calib.evaluation.filters.RelativeFilter`). Poses of the
-recording give the start, with noise of a stated size, and the truth to judge by; nothing else. Rows are those of
+recording are used only for the start, with noise of a stated size, and for evaluation. Rows are those of
 `calib.evaluation.tracking`: sums of distances with signs, of which differences of arrival of one exchange share an
-error. Several filters run at once, which differ in what they take ranges for, and whether they listen.
+error. Several filters run in parallel, with different models of range errors, with and without overheard frames.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ from uwblink.recording.schema import Poses, Tag
 from uwblink.settings import setting
 
 BASELINES: Final = (", own ranges", ", ranges only")
-"""Ends of the names of filters that do not listen: by ranges of the reference, as a robot that is alone with what its
-own tags measure; by those of the whole team."""
+"""Suffixes of the names of filters without overheard frames: with the ranges of the reference only, as measured by the
+robot's own tags; with the ranges of the whole team."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,10 +60,10 @@ class TeamSettings(CheckedSettings):
     """How relative poses are estimated, in the frame of the body `reference`, by default the first by name.
 
     The start is the relative pose and velocity at the first exchange with noise of `start_std_m` and `start_std_m_s` an
-    axis and `start_std_deg` about each, drawn from `seed`. `use` is "exchanges", or "receptions": what robots
-    overheard, too. Poses are predicted at every exchange and `rate_hz` times a second. A range is taken when its
-    squared innovation over its variance is below `gate`. With `online` one more filter has delays as states. `noise` is
-    that of the IMUs.
+    axis and `start_std_deg` about each, drawn from `seed`. `use` is "exchanges", or "receptions": also overheard
+    frames. Poses are predicted at every exchange and `rate_hz` times a second. A range is accepted if its squared
+    innovation over its variance is below `gate`. With `online` one more filter has delays as states. `noise` is the
+    noise of the IMUs.
 
     >>> import calib
     >>> calib.TeamSettings(use="receptions").start_std_deg
@@ -86,7 +86,7 @@ class TeamSettings(CheckedSettings):
 class RelativeTrack(Track):
     """Poses of a body in the frame of another: positions (n, 3), attitudes x y z w (n, 4), and the true ones.
 
-    `nees` (n,) are of positions and attitudes, six degrees of freedom.
+    `nees` (n,) are for positions and attitudes, with six degrees of freedom.
     """
 
     DEGREES: ClassVar[int] = 6
@@ -102,16 +102,17 @@ class RelativeTrack(Track):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class RelativePose(Localization):
-    """One body of a team, in the frame of another: tracks by filter (`FILTERS`), by what was asked to be used.
+    """One body of a team, in the frame of another: tracks by filter (`FILTERS`), with the measurements that the
+    settings select.
 
-    Further tracks are "dead reckoning" and, where the team listens, those of filters that do not (`BASELINES`).
+    Further tracks are "dead reckoning" and, if overheard frames are used, the tracks without them (`BASELINES`).
     """
 
     reference: str
 
     @property
     def label(self) -> str:
-        """Both bodies, as names of files have them."""
+        """Both bodies in names of files."""
         return f"{self.body}-from-{self.reference}"
 
 
@@ -119,9 +120,9 @@ class RelativePose(Localization):
 class _Team(Measurements):
     """A recording: bodies with IMUs, the reference last, and measurements (n,) between them.
 
-    `body` (n, k, 2) and `arm` (n, k, 2, 3) are those of the ends of distances. `shares` (n, k, 3) are the states of
-    errors that they share: of pairs of tags, those that last and those that stay, and then of pairs of bodies.
-    `readings` are times in seconds and inertial readings of each body.
+    `body` (n, k, 2) and `arm` (n, k, 2, 3) are body and lever arm of the ends of distances. `shares` (n, k, 3) are the
+    states of shared errors: lasting and constant errors of pairs of tags, then errors of pairs of bodies. `readings`
+    are times in seconds and inertial readings of each body.
     """
 
     bodies: list[str]
@@ -132,7 +133,7 @@ class _Team(Measurements):
     poses: Poses
 
     def points_m(self, time_ns: Ints) -> Floats:
-        """Return points of each body in the world, a metre along its axes and its middle, NaN where poses do not say.
+        """Return points of each body in the world, a metre along its axes and its centre, NaN without a pose.
 
         The shape is (bodies, n, 4, 3).
         """
@@ -146,7 +147,7 @@ class _Team(Measurements):
         """Return positions (n, bodies, 3) and attitudes (n, bodies, 3, 3) in the frame of the reference, which is left
         out.
 
-        Where poses do not say, positions are NaN and attitudes the identity.
+        Without poses, positions are NaN and attitudes the identity.
         """
         points = self.points_m(time_ns)
         middle = points[-1, :, 3:]
@@ -157,7 +158,7 @@ class _Team(Measurements):
     def start(self) -> tuple[Floats, Floats, Floats]:
         """Return positions, velocities (bodies, 3) and attitudes (bodies, 3, 3) at the first exchange.
 
-        Velocities are those of parabolas through poses of the first 0.2 s.
+        Velocities are derivatives of parabolas through poses of the first 0.2 s.
         """
         points = self.points_m(self.time_ns[0] + 10**8 * np.arange(3))
         place, turned = self.relative_poses(self.time_ns[:1])
@@ -172,8 +173,8 @@ def localize_team(
 
     `data` is what `localize_onboard` takes. Bodies without inertial readings, and so anchors, are left out. Robots with
     one tag are estimated with a `WeakHeadingWarning`. Raises what `Calibration.apply` raises, and `UnanswerableError`
-    where fewer than two robots have inertial readings, where these do not range with each other, where nothing was
-    overheard although it is to be used, and where poses do not give the start.
+    if fewer than two robots have inertial readings, if these do not range with each other, if overheard frames are to
+    be used but absent, and if poses do not give the start.
 
     >>> import calib
     >>> known = calib.fit(calib.sample_flight()).calibration
@@ -243,7 +244,7 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
     readings = [inertial_readings(imu, one, int(time_ns[0])) for one in bodies]
     last_s = float(np.ptp(time_ns)) * 1e-9
     for one, (time_s, _) in zip(bodies, readings, strict=True):
-        # Beyond the first and last reading they count as constant, for a tenth of a second at most.
+        # Beyond the first and last reading they are taken as constant, for a tenth of a second at most.
         if time_s[0] > 0.1 or time_s[-1] < last_s - 0.1:
             raise UnanswerableError(
                 f"{name}: inertial readings of {one} cover {time_s[0]:.1f} to {time_s[-1]:.1f} s after the first "
@@ -264,7 +265,9 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
 
 
 def _start(team: _Team, settings: TeamSettings, filters: int) -> RelativeFilter:
-    """Return filters that begin at the relative poses of the first exchange with noise, and know nothing else of it."""
+    """Return filters that begin at the relative poses of the first exchange with noise; they get no other
+    true value.
+    """
     place, speed, attitude = team.start()
     lost = [body for body, one in zip(team.bodies, place + speed, strict=False) if not np.isfinite(one).all()]
     if lost:
@@ -293,10 +296,10 @@ def _run(
 ) -> dict[str, dict[str, RelativeTrack]]:
     """Run filters on the measurements that each uses (n,); return the tracks of each body by filter.
 
-    States beside those of `RelativeFilter` are errors in units of their standard deviation: as in `run_filters` of
-    pairs of tags and of an exchange, and of pairs of bodies what is not linear in their distances.
+    States in addition to those of `RelativeFilter` are errors in units of their standard deviation: errors of pairs of
+    tags and of an exchange as in `run_filters`, and non-linear parts of distances by pairs of bodies.
     """
-    # Raw ranges are not corrected, neither for patterns.
+    # Raw ranges are not corrected, also not for patterns.
     raw = filters["dead reckoning"][0]
     corrected = np.array([one is not raw for one, _ in filters.values()])
     known, uses = [one for one, _ in filters.values()], np.stack([used for _, used in filters.values()], axis=1)
@@ -311,8 +314,8 @@ def _run(
     firsts = np.append(np.searchsorted(team.time_ns, time_ns), len(team.rows))
     truth, turned = team.relative_poses(time_ns)
     pose = BODY * np.arange(len(team.bodies) - 1)[:, None] + np.r_[P, A]
-    # How long the shared errors last: of pairs of tags; of pairs of bodies, 5 s, as errors of the state across the line
-    # of sight do; of an exchange.
+    # Durations of shared errors: of pairs of tags; of pairs of bodies, 5 s, as errors of the state across the line of
+    # sight; of an exchange.
     lasting = np.full((len(known), team.shares.max() + 2), np.inf)
     lasting[:, team.shares[..., 2].min() : -1] = 5.0
     lasting[:, : team.shares[..., 1].min()] = [[one.lasting_s] for one in known]
@@ -326,7 +329,7 @@ def _run(
             running.predict(time_s[k] - time_s[k - 1], inertial[k - 1, :-1], inertial[k - 1, -1])
         for row in range(firsts[k], firsts[k + 1]):
             if team.exchange[row] != exchange:
-                # Two exchanges at one time share no error, either.
+                # Two exchanges at the same time do not share an error, either.
                 kept = np.exp(-np.maximum(time_s[k] - last_s, 1e-9) / lasting)
                 running.decay(kept)
                 bank.pass_time(time_s[k] - max(last_s, 0.0))
@@ -341,7 +344,7 @@ def _run(
                 slopes[:, sides] += team.sign[row, which] * bent_m[:, which]
             slopes[:, last], slopes[:, bank.delays] = bank.common[row], bank.slopes[row]
             bank.observe(row, slopes, expected, team.shares[row, :, 0])
-        # Attitudes are averaged as rotation vectors from those of the likeliest model.
+        # Attitudes are averaged as rotation vectors relative to the likeliest model.
         bodies, likeliest = running.attitude[:, :-1], average.weights.argmax(axis=1)
         away = Rotation.from_matrix((bodies[likeliest, None].swapaxes(-1, -2) @ bodies).reshape(-1, 3, 3)).as_rotvec()
         places = np.broadcast_to(running.own[..., P], (len(likeliest), *running.own.shape[:2], 3))
@@ -412,7 +415,7 @@ def team_json(found: list[RelativePose]) -> dict[str, Any]:
 
 
 def _reductions(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return by which share listening lowers the RMSE of the position, by baseline and filter."""
+    """Return the relative reduction of the position's RMSE by overheard frames, by baseline and filter."""
     both = {end[2:]: {name: name + end for name in rows if name + end in rows} for end in BASELINES}
     return {
         end: {name: 1 - rows[name]["rmse_m"] / rows[other]["rmse_m"] for name, other in names.items()}

@@ -1,8 +1,8 @@
 """Extended Kalman filters of one body: settings, measurements, the run, and the resulting tracks.
 
 State is the body's position; its velocity and attitude are inputs taken from motion capture, velocity with noise; the
-places of the other bodies are known (ICRA 2023, section V). A measurement is a sum of distances with signs: one of a
-range, two of a difference of arrival (`calib.data.arrivals`), of which those between other bodies are known.
+places of the other bodies are known (ICRA 2023, section V). A measurement is a sum of distances with signs: one for a
+range, two for a difference of arrival (`calib.data.arrivals`); distances between other bodies are known.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Trajectory = tuple[Ints, Floats, Floats]
 FILTERS: Final = ("raw", "calibrated", "variance", "robust", "online")
 
 PATIENCE_S: Final = 10.0
-"""Most seconds for which a filter that explained its ranges is trusted while it does not.
+"""Maximum time in seconds without restart for a filter that no longer explains its ranges, but did before.
 
 Between metal racks (scenarios/hall_with_metal) half of a body's ranges are metres too long for up to nine seconds, and
 a position from these ranges alone is metres off.
@@ -43,17 +43,16 @@ a position from these ranges alone is metres off.
 class Settings(CheckedSettings):
     """Settings of the filters of `localize`.
 
-    The velocity input comes at `velocity_rate_hz` with white noise of `velocity_std_mps` an axis; that is the process
-    noise. Percentages depend on it: the noisier velocity, the more the ranges decide. Filters begin at the true place,
-    but for noise of `initial_std_m` and an `initial_offset_m` that they do not know of. A range is taken when its
+    The velocity input has the rate `velocity_rate_hz` and white noise of `velocity_std_mps` per axis, which is the
+    process noise. Percentages depend on it: with noisier velocity, ranges have more weight. Filters begin at the true
+    place plus noise of `initial_std_m` and an `initial_offset_m` that is unknown to them. A range is accepted if its
     squared innovation over its variance is below `gate` (the default is the 99.9 % quantile of chi-square with one
-    degree of freedom); the robust filter has no gate. A filter begins anew where its last ranges say (`multilaterate`)
-    once the time in which ranges were within the gate, 10 s at most, is used up by time in which they were not (half of
-    it where the robust filter takes them for reflected), and half of `reopen_s` besides. `seeds` are runs with other
-    noise, each body and flight with its own; tracks are those of the first, `seed`. `use` is "exchanges", a body's
-    ranges, or "receptions", with all that it overheard and others overheard of it. With `online` one more filter
-    averages over fixed delays and delays that drift (`calib.online.DelayStates`). Raises `BadInputError` that names the
-    setting.
+    degree of freedom); the robust filter has no gate. A filter restarts at the fix by its last ranges (`multilaterate`)
+    if they were outside the gate for longer than they were inside before, 10 s at most, plus half of `reopen_s`. Time
+    in which the robust filter takes ranges for reflected counts half. `seeds` are runs with other noise, each body and
+    flight with its own; tracks are from the first, `seed`. `use` is "exchanges", a body's ranges, or "receptions", also
+    with overheard frames of and by the body. With `online` one more filter averages over fixed delays and delays that
+    drift (`calib.online.DelayStates`). Raises `BadInputError` that names the setting.
     """
 
     velocity_std_mps: float = 0.3
@@ -74,11 +73,11 @@ class Track:
     """Estimated and true positions of a body (n, 3) at times (n,), with attitudes x y z w (n, 4).
 
     `std_m` (n,) is the standard deviation by the filter itself: the root of the sum of its three variances. `nees` (n,)
-    are the squared errors over their covariance, which should be `DEGREES`. Truth and `nees` are NaN where poses do not
-    say. `nis` (measurements,) are the squared innovations over their variance, and `accepted` (measurements,) which are
-    within the gate. `offsets` (measurements,) are the probabilities that pairs have constants in this flight, `drifts`
-    (measurements,) those that delays drift. `delays` are those at the end and their standard deviations by tag, in ns,
-    where they are states.
+    are the squared errors over their covariance, which should be `DEGREES`. Truth and `nees` are NaN without poses.
+    `nis` (measurements,) are the squared innovations over their variance, and `accepted` (measurements,) whether they
+    are within the gate. `offsets` (measurements,) are the probabilities that pairs have constants in this flight,
+    `drifts` (measurements,) the probabilities that delays drift. `delays` are the delays at the end and their standard
+    deviations by tag, in ns, if they are states.
     """
 
     DEGREES: ClassVar[int] = 3
@@ -97,7 +96,7 @@ class Track:
 
     @property
     def known(self) -> Bools:
-        """At which times (n,) the true position is known."""
+        """Whether the true position is known at each time (n,)."""
         return np.asarray(np.isfinite(self.truth_m).all(axis=1))
 
     @property
@@ -112,7 +111,7 @@ class Track:
         return {"": (self.time_ns, self.estimate_m, self.attitude)} | ({"truth": truth} if len(truth[0]) else {})
 
     def __repr__(self) -> str:
-        """Return its length and how far off it is, on one line."""
+        """Return its length and RMSE, on one line."""
         return f"track of {len(self.time_ns)} measurements, rms error {self.rmse_m:.3f} m"
 
 
@@ -133,7 +132,7 @@ class Measurements(ColumnTable):
 
     @classmethod
     def of(cls, ranges: Ranges, unknown: Callable[[Ints], Bools]) -> Measurements:
-        """Return those of ranges with a distance that is `unknown` (n, k) by its ends (n, k, 2)."""
+        """Return the measurements of ranges with an `unknown` (n, k) distance between ends (n, k, 2)."""
         ends, sign, exchange = distances_in(ranges)
         time_ns = ranges.time_ns[exchange]
         rows = np.lexsort((exchange, time_ns))
@@ -149,9 +148,9 @@ class Measurements(ColumnTable):
 
     @classmethod
     def of_body(cls, ranges: Ranges, own: Sequence[int]) -> tuple[Measurements, Floats]:
-        """Return those of a body with `own` tags, and the signs (n, k) of the distances in which it has no part.
+        """Return the measurements of a body with `own` tags, and the signs (n, k) of the distances without this body.
 
-        Distances in which it has a part begin with its tag in `ends`; the `sign` of others is 0.
+        Distances from or to the body begin with its tag in `ends`; the `sign` of others is 0.
         """
 
         def unknown(ends: Ints) -> Bools:
@@ -176,11 +175,11 @@ class Measurements(ColumnTable):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Problem(Measurements):
-    """What is known of one body at each of its measurements (n,).
+    """Inputs of the filters of one body at each of its measurements (n,).
 
-    `place` is the true one (n, 3). Of the k distances in a measurement `sign` (n, k) is 0 where the body has no part,
-    `arm` is the own lever arm turned into the world, and `other` the other antenna's place (n, k, 3); `known_m` is the
-    sum of distances in which the body has no part.
+    `place` is the true position (n, 3). Of the k distances in a measurement `sign` (n, k) is 0 for distances without
+    the body, `arm` is the own lever arm in the world's axes, and `other` the other antenna's position (n, k, 3);
+    `known_m` is the sum of distances without the body.
     """
 
     body: str
@@ -213,7 +212,7 @@ class Problem(Measurements):
 
 
 def problems(flight: Flight) -> list[Problem]:
-    """Return a problem for every body of a flight that moves, and ranges or listens while its place is known."""
+    """Return a problem for every moving body of a flight that ranges or listens while its position is known."""
     found = []
     for body in flight.moving_bodies():
         measured, others = Measurements.of_body(flight.ranges, [tag.tag for tag in flight.tags if tag.body == body])
@@ -242,7 +241,7 @@ def problems(flight: Flight) -> list[Problem]:
 
 
 def ranges_among(ranges: Ranges, tags: list[int]) -> Ranges:
-    """Return the ranges between some tags, with what these overheard of them."""
+    """Return the ranges between some tags, with the frames of these that they overheard."""
     found = ranges[
         np.isin(ranges.initiator, tags) & np.isin(ranges.target, tags) & np.isin(ranges.listener, [-1, *tags])
     ]
@@ -251,7 +250,7 @@ def ranges_among(ranges: Ranges, tags: list[int]) -> Ranges:
 
 
 def used_part(ranges: Ranges, use: str) -> Ranges:
-    """Return ranges with what was overheard, if receptions are used, or without it.
+    """Return ranges with overheard frames if receptions are used, else without them.
 
     Raises what `require_arrivals` raises.
     """
@@ -262,7 +261,7 @@ def used_part(ranges: Ranges, use: str) -> Ranges:
 
 
 def ranges_about(ranges: Ranges, tags: Sequence[int]) -> Ranges:
-    """Return the ranges of some tags with others, and those that these or others overheard, with their arrivals."""
+    """Return the ranges of some tags with others, and ranges that either overheard, with their arrivals."""
     needed, heard = np.isin(ranges.initiator, tags) ^ np.isin(ranges.target, tags), ranges.arrivals
     needed |= np.isin(ranges.listener, tags)
     if heard is not None:
@@ -279,7 +278,7 @@ def distances_in(ranges: Ranges) -> tuple[Ints, Floats, Ints]:
     listener = ranges.listener
     if heard is not None:
         exchange, listener = np.append(exchange, heard.exchange), np.append(listener, heard.listener)
-    # From the target, less from the initiator.
+    # Distance from the target minus distance from the initiator.
     listens, listener, senders = listener[:, None, None] >= 0, listener[:, None], ends[exchange, ::-1]
     of_heard = np.stack([senders, np.broadcast_to(listener, senders.shape)], axis=2)
     signs = np.where(listens[:, 0], [1.0, -1.0], [1.0, 0.0])
@@ -295,7 +294,7 @@ def nearest_attitude(poses: Poses, body: str, time_ns: Ints) -> Floats:
 
 
 def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: Settings) -> dict[str, list[Track]]:
-    """Run filters on the ranges of a body with every noise; return the tracks of each, one for each noise.
+    """Run filters on the ranges of a body for each seed; return the tracks of each filter, one per seed.
 
     A state is the position, for each pair of tags the error that its ranges share, in units of `shared_m`, the error
     that measurements of one exchange share, in units of `common_m`, and for each pair its constant, in units of
@@ -335,12 +334,13 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
         h[..., 3 + pairs], h[..., bank.delays] = bank.common[k][:, None], bank.slopes[k][:, None]
         update = bank.observe(k, h, problem.known_m[k] + distance @ problem.sign[k], pair[k])
         lasted_s = min(elapsed_s[k], most_s)
-        # Of a body among two others, one behind something, half of the ranges are reflected: that is not being lost.
+        # A body with two others, one of them behind an obstacle, has reflections in half of its ranges: no reason to
+        # restart.
         counts = np.where(update.nis < settings.gate, 1.0, np.where(update.believed, -0.5, -1.0))
         explained_s = np.minimum(explained_s + counts * lasted_s, PATIENCE_S)
         for lost in zip(*np.nonzero(explained_s < -settings.reopen_s / 2), strict=True):
             rows = slice(np.searchsorted(problem.time_ns, problem.time_ns[k] - settings.reopen_s * 1e9), k + 1)
-            # The body moved since these ranges: so do their anchors.
+            # The body moved since these ranges: anchors are moved likewise.
             anchors = problem.other[rows] - problem.arm[rows] + (moved[k] - moved[rows])[:, lost[1], None]
             known_m = problem.known_m[rows] + bank.slopes[rows, lost[0]] @ running.state[lost][bank.delays]
             fix = multilaterate(bank.measured[(rows, *lost)] - known_m, anchors, 0.0, sign=problem.sign[rows])

@@ -178,7 +178,7 @@ def _beside_power(plain: KnownDistances, covariate: Covariate, kind: str) -> Tes
         len(names) + len(tags),
     )
     tested = plain.slopes.test(Family(kind=kind, names=names, derivative=derivative))
-    return tested.beside(range(len(names), derivative.size)).turned(np.eye(len(names), derivative.size))
+    return tested.with_fitted(range(len(names), derivative.size)).combined(np.eye(len(names), derivative.size))
 
 
 def with_new_tag(calibration: Calibration, tag: int, ranges: Ranges) -> Calibration:

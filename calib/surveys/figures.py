@@ -1,4 +1,4 @@
-"""The boards of a survey, seen from above, with the ellipses in which they stand with 95 %."""
+"""The boards of a survey, seen from above, with their 95 % ellipses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from uwblink.pages.figures import label, sheet
 
 
 def board_figure(arrangements: Sequence[SurveyedArrangement], width_in: float | None = None) -> Figure:
-    """Return a figure of arrangements, a panel each: as many panels beside each other as are 2.2 inch wide.
+    """Return a figure of arrangements, one panel each; panels beside each other are at least 2.2 inch wide.
 
     `width_in` is its width in inches, by default up to three panels of 3 inch. Ellipses too small to be seen are drawn
     ten times as large and dashed.

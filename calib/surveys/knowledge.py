@@ -18,12 +18,13 @@ TAPE_M, PLACE_M = 0.005, 0.01
 a tape is read to 5 mm, and both ends of a coordinate are antennas."""
 
 MAX_LENGTH_M, MIN_SIGMA_M = 1e6, 1e-6
-"""From a micrometre to a thousand kilometres, squares and weights are numbers that can be computed with."""
+"""From a micrometre to a thousand kilometres, squares and weights do not overflow."""
 
 
 @dataclass(frozen=True, slots=True)
 class KnownPosition:
-    """Where a tag's antenna is, metres, and the standard deviation of each coordinate; in one arrangement or in all.
+    """The position of a tag's antenna, metres, and the standard deviation of each coordinate; in one arrangement or in
+    all.
 
     >>> import calib
     >>> calib.KnownPosition(1, (0.0, 0.0, 2.5)).sigma_m
@@ -41,8 +42,8 @@ class Knowledge:
     """Known facts about arrangements: `shapes` by name, and stretches of time by name, in seconds since the first
     exchange.
 
-    `shape` is that of all arrangements that `shapes` does not name; `orders` are the tags of a line as they were put
-    along it, from either end, by name.
+    `shape` is for all arrangements that are not in `shapes`; `orders` are the tags in their order along a line, from
+    either end, by name.
 
     >>> import calib
     >>> from uwblink import KnownDistance
@@ -59,12 +60,12 @@ class Knowledge:
     orders: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def shape_of(self, arrangement: Arrangement) -> str:
-        """Return what is known of where boards stand in an arrangement: what is said here, else what it says itself."""
-        said = "line" if arrangement.name in self.orders else self.shape or arrangement.known
-        return self.shapes.get(arrangement.name, said)
+        """Return the known shape of an arrangement: the one stated here, or else its own."""
+        default = "line" if arrangement.name in self.orders else self.shape or arrangement.known
+        return self.shapes.get(arrangement.name, default)
 
     def order_of(self, arrangement: Arrangement) -> tuple[int, ...]:
-        """Return in which order boards stand on a line; empty where nobody said it, or where they are on none."""
+        """Return the order of boards on a line; empty if it is not stated, or if they are not on a line."""
         order = self.orders.get(arrangement.name, arrangement.order)
         return tuple(order) if self.shape_of(arrangement) == "line" else ()
 
@@ -101,16 +102,15 @@ KEYS: Final[dict[str, dict[str, tuple[Callable[[Any], bool], str]]]] = {
         "arrangement": WORD,
     },
 }
-"""The keys of the tables of a file of known facts: which values are good, and what is expected."""
+"""The keys of the tables of a file of known facts: tests of values, and the expected values."""
 
 
 def load_knowledge(path: str | os.PathLike[str]) -> Knowledge:
     """Read a TOML file of `[[arrangements]]`, `[[distances]]` and `[[positions]]`; raises `BadInputError`, one line.
 
-    `known = "line"` or "plane" at the head holds for all arrangements but those with a `known` of their own; an
-    arrangement has `name`, and any of `known`, `order = [3, 1, 2]`, `start_s` and `end_s`. A distance has
-    `between = [1, 2]`, `distance_m`, and any of `sigma_m` and `arrangement`; a position `tag`, `position_m`, and any of
-    the same two.
+    `known = "line"` or "plane" at the head is for all arrangements without their own `known`; an arrangement has
+    `name`, and any of `known`, `order = [3, 1, 2]`, `start_s` and `end_s`. A distance has `between = [1, 2]`,
+    `distance_m`, and any of `sigma_m` and `arrangement`; a position `tag`, `position_m`, and any of the same two.
     """
     file = TomlReader(Path(path), BadInputError, "file of what is known")
     file.known(file.table, ("known", *KEYS))
@@ -159,7 +159,7 @@ def _how_and_where(row: Mapping[str, Any], default: float) -> tuple[float, str]:
 
 
 def check_knowledge(knowledge: Knowledge, tags: Mapping[str, set[int]]) -> None:
-    """Raise `BadInputError` for what names an arrangement or tags that are not there; `tags` are those by arrangement.
+    """Raise `BadInputError` for names of absent arrangements or tags; `tags` are the present ones by arrangement.
 
     Lengths that come from Python are checked here, too.
     """

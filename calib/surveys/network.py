@@ -1,8 +1,8 @@
-"""Boards that stand still as a network of distances: unknown places, delays and curve, and rows of what was measured.
+"""Boards that stand still as a network of distances: unknown places, delays and curve, and rows of measurements.
 
 A mean of raw ranges of a pair is distance - w_i d_i - w_j d_j + curve(power) + error, with delays d (docs/theory.md).
-Its error is constant for a pair and an arrangement, so more ranges do not shrink it: it has a variance of its own,
-which is estimated (`calib.surveys.solution`). Known positions and delays are priors of the unknowns.
+Its error is constant for a pair and an arrangement, so more ranges do not reduce it: it has a separate variance, which
+is estimated (`calib.surveys.solution`). Known positions and delays are priors of the unknowns.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.schema import KnownDistance
 
 DIMENSIONS = {"line": 1, "plane": 2, "": 3}
-"""In how many dimensions boards may stand, by what is known of an arrangement."""
+"""The number of dimensions of an arrangement, by its known shape."""
 
 
 EXTRA_M, EXTRA_STD_M = 0.3, 0.25
-"""Prior mean and standard deviation of how much longer a reflected path is (published detours are 0.1 to 0.5 m).
-Half or twice of either moves delays beside reflections by 0.28 standard errors (`python -m benchmarks.constants`)."""
+"""Prior mean and standard deviation of the detour of a reflected path (published detours are 0.1 to 0.5 m). Half or
+twice of either moves delays beside reflections by 0.28 standard errors (`python -m benchmarks.constants`)."""
 
 CURVE_LENGTH_DB = 4.0
 """Length of the Gaussian process (Matern 5/2 over decibels) that is the prior of a curve.
 
 From the three published curves of boards (`icra2023`, `icra2023-july`, `miluv` of `uwbsim`): at 13 powers from -95 to
--77 dBm, with errors of 5 mm, the likeliest lengths are 4, 6 and 4 dB, the mean standard deviations 0.11, 0.14 and
-0.09 m, each known to a factor of 1.7. The shorter length costs little where a curve is straight; the longer one takes a
-bend for an error of pairs, and what all delays share for what it is not.
+-77 dBm, with errors of 5 mm, the likeliest lengths are 4, 6 and 4 dB, the mean standard deviations 0.11, 0.14 and 0.09
+m, each known to a factor of 1.7. The shorter length has little disadvantage for a straight curve; with the longer one a
+bend is taken for errors of pairs, and biases the common part of all delays.
 """
 
 
@@ -58,12 +58,12 @@ class CurvePrior:
 
     @classmethod
     def at(cls, lifted: Floats) -> CurvePrior | None:
-        """Return that of a curve at lifted powers (n,); None where powers lack, or hardly vary."""
+        """Return the prior of a curve at lifted powers (n,); None if powers are missing, or hardly vary."""
         power = in_dbm(lifted)
         if not np.isfinite(power).all() or np.ptp(power) < NARROWEST_DB:
             return None
         low, high = float(power.min()), float(power.max())
-        # Twelve segments are enough that splines follow a process of this length over 25 dB; the prior, not their
+        # Twelve segments are enough for splines to represent a process of this length over 25 dB; the prior, not their
         # number, makes them smooth.
         inner = 10 ** ((np.linspace(low, high, 13) - ALPHA_DBM) / 10)
         knots = np.concatenate([[inner[0]] * DEGREE, inner, [inner[-1]] * DEGREE])
@@ -79,16 +79,16 @@ class CurvePrior:
 
 
 def in_dbm(lifted: Floats) -> Floats:
-    """Return the powers that lifted ones stand for, NaN for none."""
+    """Return the powers in dBm of lifted ones, NaN if there is none."""
     return np.asarray(ALPHA_DBM + 10 * np.log10(np.where(lifted > 0, lifted, np.nan)))
 
 
 @dataclass(frozen=True, slots=True)
 class Boards:
-    """The boards of an arrangement: its name, in how many dimensions they may stand, and their tags.
+    """The boards of an arrangement: its name, its number of dimensions, and their tags.
 
-    `order` are tags as they are said to stand along a line, or nothing. Where `freed`, the last dimension is how far
-    they stand beside the line or plane that they are said to be on.
+    `order` are tags in their stated order along a line, or nothing. If `freed`, the last dimension is the distance from
+    the stated line or plane.
     """
 
     name: str
@@ -99,33 +99,35 @@ class Boards:
 
     @property
     def shape(self) -> str:
-        """Which of `SHAPES` has as many dimensions."""
+        """The shape (`SHAPES`) with this number of dimensions."""
         return {dimensions: shape for shape, dimensions in DIMENSIONS.items()}[self.dimensions]
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What a network's errors may be: which means are reflected (n,), the spread of pairs and that of the curve, m."""
+    """A hypothesis on a network's errors: which means are reflected (n,), the spread of pairs and the spread of the
+    curve, m.
+    """
 
     marks: Bools
     pair_m: float
     curve_m: float
 
     def scaled(self, pair: float, curve: float) -> Case:
-        """Return the case with other spreads, by the logarithms of their factors."""
+        """Return the case with spreads multiplied by factors, given by logarithms."""
         return replace(self, pair_m=self.pair_m * math.exp(pair), curve_m=self.curve_m * math.exp(curve))
 
 
 class Linear:
-    """A network that is linear about unknowns (p,) in a case: all errors are normal.
+    """A network that is linearized about unknowns (p,) in a case: all errors are normal.
 
-    `left` (n,) is measured less predicted and `jacobian` (n, p) the derivative of what is predicted, both over the
-    standard deviation `std` (n,) of each row. `information` (p, p) is that of the rows, `prior` (p, p) the precision of
-    the priors, and `slope` (p,) that of the log likelihood of both.
+    `left` (n,) is measured minus predicted and `jacobian` (n, p) the derivative of the prediction, both divided by the
+    standard deviation `std` (n,) of each row. `information` (p, p) is the information of the rows, `prior` (p, p) the
+    precision of the priors, and `slope` (p,) the slope of the log likelihood of both.
     """
 
     def __init__(self, network: Network, x: Floats, case: Case) -> None:
-        """Take the derivatives at unknowns (p,)."""
+        """Compute the derivatives at unknowns (p,)."""
         (left, jacobian), priors = network.linear(x, case.marks), network.priors(case.curve_m)
         precision, self.std = priors.precision(), network.std_m(case)
         self.left, self.jacobian = left / self.std, jacobian / self.std[:, None]
@@ -137,7 +139,7 @@ class Linear:
 
     @property
     def known(self) -> Floats:
-        """The information (p, p) of the rows and of what is known, without guesses."""
+        """The information (p, p) of the rows and of known facts, without guesses."""
         found, guessed = self.information + self.prior, (self._guessed, self._guessed)
         found[guessed] -= self.prior[guessed]
         return found
@@ -162,7 +164,7 @@ class Linear:
 
 @dataclass(frozen=True)
 class Lengths:
-    """Rows of lengths that were measured, in a `case` (`Network.linear`)."""
+    """Rows of measured lengths, in a `case` (`Network.linear`)."""
 
     network: Network
     case: Case
@@ -176,11 +178,12 @@ class Lengths:
 
 @dataclass(frozen=True, kw_only=True)
 class Network:
-    """Means of pairs, the boards they belong to, and what is known beside them.
+    """Means of pairs, their boards, and other known facts.
 
-    `pair_m` is the constant error of pairs, None to estimate it. The unknowns are three coordinates of each point
-    (a tag in an arrangement), delays in ns, and coefficients of the curve over power. Coordinates beyond an
-    arrangement's dimensions are zero; the unknowns `held` (indices) stay as they are, as those that fix a frame.
+    `pair_m` is the standard deviation of constant errors of pairs, None to estimate it. The unknowns are three
+    coordinates of each point (a tag in an arrangement), delays in ns, and coefficients of the curve over power.
+    Coordinates beyond an arrangement's dimensions are zero; the unknowns `held` (indices) are fixed, such as those that
+    define a frame.
     """
 
     means: PairMeans
@@ -205,7 +208,7 @@ class Network:
         return np.array([k for k, _ in self.points])
 
     def holding(self, known: KnownDistance | KnownPosition) -> list[int]:
-        """Return the arrangements in which a distance or a position is known."""
+        """Return the arrangements in which a distance or a position is valid."""
         who = {known.first, known.second} if isinstance(known, KnownDistance) else {known.tag}
         return [
             k
@@ -217,7 +220,7 @@ class Network:
     def tapes(self) -> tuple[Ints, Floats]:
         """The two points of each known distance (k, 2); distance, standard deviation, number of the statement (k, 3).
 
-        What holds in several arrangements is one reading, not several.
+        A distance that is valid in several arrangements is one reading, not several.
         """
         ends, rows = [], []
         for number, one in enumerate(self.distances):
@@ -242,15 +245,15 @@ class Network:
         boards, axis = [self.arrangements[k] for k in self.owner.tolist()], np.arange(3)
         known = axis >= np.array([[one.dimensions] for one in boards])
         beside = axis == np.array([[one.dimensions - 1 if one.freed else -1] for one in boards])
-        # A coordinate that is not known is held to 30 m; how far boards stand beside a line, or a plane, that is none
-        # to decimetres, as nobody overlooks a metre.
+        # The prior of an unknown coordinate is 30 m; of a distance from a wrong line or plane it is decimetres, because
+        # an error of a metre would be noticed.
         std, centre = np.where(beside, 0.5, 30.0), np.zeros((len(boards), 3))
         for point, (place, _) in self.known_places.items():
             centre[self.owner == self.owner[point]] = place
         for point, (place, sigma) in self.known_places.items():
             centre[point], std[point] = place, sigma
         delays = np.array([self.fixed_ns.get(tag, 0.0) for tag in self.tags])
-        # A known delay is held to 0.03 mm, far below any result.
+        # The prior of a known delay is 0.03 mm, far below the error of any result.
         certain = np.array([1e-4 if tag in self.fixed_ns else BOARD_DELAY_STD_NS for tag in self.tags])
         curves = [] if self.curve is None else [self.curve.precision]
         blocks = [
@@ -276,7 +279,7 @@ class Network:
 
     @cached_property
     def guessed(self) -> Ints:
-        """The unknowns whose prior is no knowledge: places and delays that nobody stated."""
+        """The unknowns whose prior is only a guess: places and delays that were not stated."""
         places = [3 * k + axis for k in self.points.values() if k not in self.known_places for axis in range(3)]
         delays = [k for k, tag in enumerate(self.tags, start=3 * len(self.points)) if tag not in self.fixed_ns]
         return np.array([*places, *delays], dtype=np.int64)
@@ -286,11 +289,13 @@ class Network:
         return np.flatnonzero(self.owner == arrangement)
 
     def positions_m(self, x: Floats) -> Floats:
-        """Return the points (points, 3) that a vector of unknowns stands for."""
+        """Return the points (points, 3) of a vector of unknowns."""
         return x[self.layout.where["place"]].reshape(-1, 3).copy()
 
     def with_positions(self, x: Floats, positions: Floats, seats: Ints | slice = slice(None)) -> Floats:
-        """Return a vector of unknowns with other points (points, 3), or others of some `seats`, where they are free."""
+        """Return a vector of unknowns with other points (points, 3), or other points of some `seats`, if
+        they are free.
+        """
         place, found, free = self.positions_m(x), x.copy(), self.layout.free()
         place[seats] = positions
         mine = free[free < place.size]
@@ -299,7 +304,7 @@ class Network:
 
     @cached_property
     def ends(self) -> Ints:
-        """The points between which each length was measured (n, 2): means, then known distances."""
+        """The two points of each measured length (n, 2): means, then known distances."""
         rows = zip(self.means.arrangement.tolist(), self.means.ends.tolist(), strict=True)
         of_means = [(self.points[k, i], self.points[k, j]) for k, (i, j) in rows]
         return np.concatenate([np.array(of_means).reshape(-1, 2), self.tapes[0]])
@@ -316,16 +321,16 @@ class Network:
         return found
 
     def linear(self, x: Floats, marks: Bools | float = 0.0) -> tuple[Floats, Floats]:
-        """Return what is left of each row (n,), and derivatives (n, p): means, known distances.
+        """Return the residuals (n,) and derivatives (n, p) of rows: means, known distances.
 
-        Of means with `marks` (n,) a detour is taken off.
+        A detour is subtracted from means with `marks` (n,).
         """
         place, found = self.positions_m(x), self._of_delays_and_curve.copy()
         apart = place[self.ends[:, 0]] - place[self.ends[:, 1]]
         length = np.linalg.norm(apart, axis=1)
         measured = np.concatenate([self.means.range_m - EXTRA_M * marks, self.tapes[1][:, 0]])
         left = measured - length - found @ x
-        # Boards on top of each other have no direction: any will do to part them.
+        # Boards at the same place have no direction: any direction separates them.
         unit = np.where(length[:, None] > 1e-9, apart / np.maximum(length, 1e-9)[:, None], [1.0, 0.0, 0.0])
         columns = 3 * self.ends[:, :, None] + np.arange(3)
         np.put_along_axis(found, columns.reshape(len(found), -1), np.hstack([unit, -unit]), axis=1)
@@ -347,7 +352,7 @@ class Network:
         return found
 
     def alone(self, arrangement: int) -> Network:
-        """Return the network of the means of one arrangement, in which only its places are sought."""
+        """Return the network of the means of one arrangement, with only its places as unknowns."""
         rows, unknowns = self.means.arrangement == arrangement, np.arange(self.layout.size)
         curve = None if self.curve is None else replace(self.curve, design=self.curve.design[rows])
         own = np.isin(unknowns // 3, self.seats(arrangement)) & np.isin(unknowns, self.layout.free())

@@ -1,4 +1,4 @@
-"""From a solution to what a survey returns: calibration, what is determined, reflections, places in a stated frame."""
+"""From a solution to the result of a survey: calibration, determined delays, reflections, places in a stated frame."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from uwblink.ticks import SPEED_OF_LIGHT
 
 
 def students_factor(freedom: float) -> float:
-    """Return by how much Student's 95 % quantile is more than the normal one: the spread of errors is estimated.
+    """Return the ratio of Student's 95 % quantile to the normal one, because the spread of errors is estimated.
 
     Its prior counts as a few degrees of freedom.
     """
@@ -43,9 +43,9 @@ def students_factor(freedom: float) -> float:
 
 
 def verdict_on_delays(information: Floats, tags: Sequence[int]) -> Verdict:
-    """Return what is determined of delays by their information (tags, tags), 1/ns^2."""
+    """Return the verdict on delays from their information (tags, tags), 1/ns^2."""
     # Devices of one design differ by half a nanosecond (published ones by 0.6 ns); a delay is determined if its
-    # standard error is at most `LOOSEST` of it.
+    # standard error is at most `LOOSEST` of this.
     return judge(information, [InformationColumn("delay", str(tag), 0.5) for tag in tags])
 
 
@@ -148,7 +148,7 @@ def _notes(
 def _calibration(
     data: SurveyData, found: Solution, verdict: Verdict, taken: Calibration | None, more: dict[str, Any]
 ) -> Calibration:
-    """Return the calibration: delays that are determined, the curve, how well both are known and what they rest on."""
+    """Return the calibration: delays that are determined, the curve, their uncertainty and provenance."""
     network, known, freedom = found.network, verdict.determined, found.freedom
     tags = [tag for tag, good in zip(network.tags, known.tolist(), strict=True) if good]
     covariance = students_factor(freedom) ** 2 * verdict.covariance[np.ix_(known, known)]
@@ -210,7 +210,7 @@ def _calibration(
 
 
 def widened_by(found: Solution, curve: Calibration) -> Solution:
-    """Return a solution whose covariance has what the errors of a curve that was taken over do to delays and places."""
+    """Return a solution whose covariance includes the effect of errors of a given curve on delays and places."""
     here, means = found.linear, found.network.means
     splines = basis(np.clip(means.lifted, *curve.bias_curve.range), np.array(curve.bias_curve.knots))
     count = len(splines)
@@ -233,9 +233,9 @@ def in_frames(found: Solution) -> Solution:
 
 
 def _frame(points: Floats, boards: Boards) -> tuple[Floats, list[int], str]:
-    """Return the axes (3, 3) of the frame of the first boards, which coordinates make it, and it in words.
+    """Return the axes (3, 3) of the frame of the first boards, the coordinates that define it, and a description.
 
-    The first is the origin, x points to the second, y to the side of the next beside it.
+    The first is the origin, x points to the second, y to the side of the next board beside this line.
     """
     away = points - points[0]
     x = away[1] / max(float(np.linalg.norm(away[1])), 1e-9)
@@ -254,7 +254,7 @@ def _frame(points: Floats, boards: Boards) -> tuple[Floats, list[int], str]:
 
 
 def _arrangement(found: Solution, number: int) -> SurveyedArrangement:
-    """Return where boards stood in an arrangement, in the frame of known positions or that of its first boards."""
+    """Return the places of boards in an arrangement, in the frame of known positions or of its first boards."""
     network, boards, seats = found.network, found.network.arrangements[number], found.network.seats(number)
     points, covariance = network.positions_m(found.x), found.covariance() * students_factor(found.freedom) ** 2
     own = [slice(3 * seat, 3 * seat + 3) for seat in seats.tolist()]

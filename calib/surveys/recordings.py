@@ -1,8 +1,8 @@
 """From recordings to arrangements (marked, named in a file, or found from the ranges) and to a mean of each pair.
 
-While nothing moves, all that a pair's ranges say of delays and places is their mean: the location of direct ranges in
-the error model of all ranges (`calib.estimator.range_model`). A mean has the mean power of its ranges: what power
-varies by while nothing moves is an error of its measurement.
+While nothing moves, the mean of a pair's ranges has all their information on delays and places. It is the location of
+direct ranges in the error model of all ranges (`calib.estimator.range_model`). A mean has the mean power of its ranges,
+because power varies only by errors of its measurement while nothing moves.
 """
 
 from __future__ import annotations
@@ -34,27 +34,28 @@ from uwblink.recording.summary import single_reports
 from uwblink.ticks import METRES_PER_TICK
 
 LIFT = "mean-of-lifted"
-"""How the powers of both ends become one, as in `calib.fit`."""
+"""How the powers of both ends are combined, as in `calib.fit`."""
 
 
 PARTS = 10
-"""Stretches of time whose sums say how well the mean of all is known, also where errors last: the standard error is
-known to a quarter (the root of 1/18), and those of an arrangement held for 30 s are 3 s long."""
+"""Number of stretches of time whose sums determine the standard error of the mean, also with errors that last: it is
+known to a quarter (the root of 1/18); in an arrangement of 30 s they are 3 s long."""
 
 WINDOW_BINS = 5
-"""Bins of a second before and after an instant whose medians are compared: a hand needs less to move a board."""
+"""Number of bins of a second before and after an instant whose medians are compared: moving a board takes less time."""
 
 
 SIGMAS = 6.0
-"""Standard deviations of noise from which a change is one: one in 5e8 by chance, and there are thousands."""
+"""Limit of changes in standard deviations of noise: one in 5e8 exceeds it by chance, and there are
+thousands of tests."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairMeans(ColumnTable):
     """One row a pair and arrangement (n,): `ends` (n, 2) are its tags, the smaller first, `weights` multiply delays.
 
-    `range_m` is the mean of raw ranges, `std_m` how well it is known, `noise_m` the spread of single ranges, `lifted`
-    the mean lifted power, NaN without.
+    `range_m` is the mean of raw ranges, `std_m` its standard error, `noise_m` the spread of single ranges, `lifted` the
+    mean lifted power, NaN without one.
     """
 
     arrangement: Ints
@@ -69,7 +70,7 @@ class PairMeans(ColumnTable):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyData:
-    """Means of pairs, the arrangements whose numbers they carry, distances that recordings state, and what to say."""
+    """Means of pairs, the arrangements by their numbers, distances in recordings, and warnings."""
 
     means: PairMeans
     arrangements: tuple[Arrangement, ...]
@@ -83,7 +84,7 @@ class SurveyData:
 def read_surveys(data: Data | Iterable[Data], knowledge: Knowledge) -> SurveyData:
     """Return the means of pairs of one or more recordings by arrangement.
 
-    Raises `BadInputError` for two arrangements of one name, `UnanswerableError` where no boards stood still.
+    Raises `BadInputError` for two arrangements with the same name, `UnanswerableError` if no boards stood still.
     """
     recordings = [_load(one) for one in each(data)]
     if knowledge.spans_s and len(recordings) > 1:
@@ -113,7 +114,7 @@ def read_surveys(data: Data | Iterable[Data], knowledge: Knowledge) -> SurveyDat
 
 
 def _load(data: Data) -> tuple[Ranges, list[Arrangement], list[KnownDistance]]:
-    """Return the possible ranges of a recording, whose true distances are not looked at, and what it says beside."""
+    """Return the possible ranges of a recording, without true distances, and its other contents."""
     if isinstance(data, Ranges):
         return replace(data, truth_m=np.zeros(len(data))).usable(need_power=False), [], []
     with opened(data) as (name, source):
@@ -147,7 +148,7 @@ def _arrangements(
 
 def _binned(ranges: Ranges, bin_ns: int) -> tuple[Ints, Ints, Floats, Floats]:
     """Return the pairs of tags (p, 2), the starts of bins of time (b,) in ns, medians (p, b) of their ranges in each
-    (NaN without any), and the noise of these medians (p,), which steps do not widen."""
+    (NaN without any), and the noise of these medians (p,), without the effect of steps."""
     pairs, begin = pairs_of(ranges.initiator, ranges.target), int(ranges.time_ns.min())
     bins, at = np.unique((ranges.time_ns - begin) // bin_ns, return_inverse=True)
     median = np.full((len(pairs.ends), len(bins)), np.nan)
@@ -160,7 +161,9 @@ def _binned(ranges: Ranges, bin_ns: int) -> tuple[Ints, Ints, Floats, Floats]:
 
 
 def _steps(median: Floats, window: int) -> Floats:
-    """Return the step (p, b + 1) of each pair at each edge of bins: the median of so many bins after, less before."""
+    """Return the step (p, b + 1) of each pair at each edge of bins: the median of the bins after minus the
+    bins before.
+    """
     padded = np.pad(median, ((0, 0), (window, window)), constant_values=np.nan)
     windows = np.ma.masked_invalid(np.lib.stride_tricks.sliding_window_view(padded, window, axis=1))
     found = np.ma.median(windows, axis=2).filled(np.nan)  # type: ignore[no-untyped-call]  # NumPy states none
@@ -170,14 +173,14 @@ def _steps(median: Floats, window: int) -> Floats:
 def still_stretches(ranges: Ranges, bin_ns: int = 1_000_000_000) -> list[tuple[int, int]]:
     """Return the stretches of time, (start, end) each in ns, in which no board was moved.
 
-    A motion is where two pairs' ranges step together (or the only pair's does). Whatever lies within a window of one,
-    or between two less than 15 s apart, belongs to none.
+    A motion is a simultaneous step of the ranges of two pairs (or of the only pair). Times within a window of a motion,
+    or between two motions less than 15 s apart, belong to no stretch.
     """
     _, starts, median, noise = _binned(ranges, bin_ns)
-    # People who walk past change ranges by less than 5 cm, or those of one pair only.
+    # People who walk past change ranges by less than 5 cm, or only the ranges of one pair.
     threshold = np.maximum(0.05, SIGMAS * noise * np.sqrt(2 / WINDOW_BINS))
     moving = (np.abs(_steps(median, WINDOW_BINS)) > threshold[:, None]).sum(axis=0) >= min(2, len(median))
-    # An edge that sees a step within its window is not the step itself: only a bin that stands free of all is still.
+    # An edge with a step in its window is not the step itself: only bins outside all such windows are still.
     still = np.concatenate([[False], ~(moving[:-1] | moving[1:]), [False]]).astype(np.int8)
     first, last = np.flatnonzero(np.diff(still) == 1), np.flatnonzero(np.diff(still) == -1) - 1
     found = zip(starts[first].tolist(), (starts[last] + bin_ns).tolist(), strict=True)
@@ -186,10 +189,10 @@ def still_stretches(ranges: Ranges, bin_ns: int = 1_000_000_000) -> list[tuple[i
 
 
 def find_motion(name: str, ranges: Ranges) -> list[Finding]:
-    """Return the board that was moved within an arrangement that should be still, if there is one.
+    """Return the board that was moved during an arrangement, if there is one.
 
-    A motion is an instant after which two of a board's pairs range otherwise, by more than noise and by 3 cm: a single
-    pair does so when somebody walks by. The board most of whose pairs change, and most, is named.
+    A motion is an instant after which the ranges of two of a board's pairs differ, by more than noise and by 3 cm; a
+    person who walks by changes a single pair. The board with the most changed pairs, and the largest changes, is named.
     """
     if len(ranges.tags()) < 3:
         return []
@@ -212,7 +215,7 @@ def find_motion(name: str, ranges: Ranges) -> list[Finding]:
     tag = ranges.tags()[board]
     mine = changed[:, edge] & (member[board] > 0)
     by_m = float(np.abs(step[mine, edge]).max())
-    # Medians of long spans hardly tell when: those of short ones do.
+    # Medians of short spans determine the time better than medians of long ones.
     edge = np.argmax(np.nan_to_num(np.abs(_steps(median, WINDOW_BINS)[mine, 1:-1])).sum(axis=0))
     text = (
         f"{name}: board {tag} was moved {(starts[edge + 1] - begin) * 1e-9:.0f} s after the start (ranges changed by "
@@ -222,7 +225,8 @@ def find_motion(name: str, ranges: Ranges) -> list[Finding]:
 
 
 def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
-    """Return the means of ranges (n,) whose `arrangement` (n,) is a number, or -1 for none; and how many were too few.
+    """Return the means of ranges (n,) whose `arrangement` (n,) is a number, or -1 for none; and the number of pairs
+    with too few ranges.
 
     Pairs of fewer than five ranges in an arrangement are left out; the second value counts them. Raises
     `UnanswerableError` where none is left.
@@ -230,7 +234,7 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
     pairs = pairs_of(ranges.initiator, ranges.target)
     key = arrangement * len(pairs.ends) + pairs.number
     keys, counts = np.unique(key[arrangement >= 0], return_counts=True)
-    # Of five ranges the spread is known to a third (the root of 1/8).
+    # With five ranges the spread is known to a third (the root of 1/8).
     kept = keys[counts >= 5]
     if not len(kept):
         raise UnanswerableError(f"{ranges.source}: no pair of boards has five ranges while all stand still")
@@ -261,7 +265,7 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
 
 
 def _locations(ranges: Ranges, groups: Pairs) -> tuple[Floats, Floats, Floats]:
-    """Return the location of the direct ranges of each group (g,), how well it is known, and the noise of a range.
+    """Return the location of the direct ranges of each group (g,), its standard error, and the noise of a range.
 
     Ranges are in order of group and time. Slopes of the likelihood are summed over parts of each group's ranges, too:
     errors that last show in these sums.
@@ -277,16 +281,16 @@ def _locations(ranges: Ranges, groups: Pairs) -> tuple[Floats, Floats, Floats]:
     )
     part = Part(parameter=RESIDUAL, kind="mean", columns=group[:, None], values=np.full((len(group), 1), -1.0))
     layout, rows = model.build(residual, errors, (mean, *unknowns), (part, *parts), only=())
-    # The likelihood has several maxima: with a moved board, that of shorter steps was less by 140.
+    # The likelihood has several maxima: with a moved board, shorter steps ended at one that was lower by 140.
     searches = (maximize([rows], Priors(layout), layout.start(), longer=longer) for longer in (LONGER, 2 * LONGER))
     found = max(searches, key=lambda one: one.value)
     values = rows.values(found.x)
     slope = errors.slopes(values)[1][RESIDUAL]
     number = np.concatenate([np.arange(n) * PARTS // n for n in count.tolist()])
     sums = np.bincount(group * PARTS + number, slope, len(count) * PARTS).reshape(-1, PARTS)
-    # What a range tells of its mean, as a share of what it would with noise alone, is the same for all.
+    # The ratio of a range's information on its mean to the information with noise alone is the same for all.
     inverse = np.exp(-2 * values["noise"])
-    told = np.bincount(group, inverse) * float(np.sum(slope**2) / np.sum(inverse))
+    information = np.bincount(group, inverse) * float(np.sum(slope**2) / np.sum(inverse))
     lasting = np.where(count >= 4 * PARTS, np.var(sums, axis=1, ddof=1) * PARTS, 0.0)
-    std = np.sqrt(np.maximum(1 / told, lasting / told**2))
+    std = np.sqrt(np.maximum(1 / information, lasting / information**2))
     return median + found.of("mean"), std, np.exp(np.bincount(group, values["noise"]) / count)

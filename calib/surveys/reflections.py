@@ -1,12 +1,12 @@
-"""Which means are reflected: a row's error is that of its pair, or with a small chance a detour that lasts.
+"""Which means are reflected: a row's error is its pair's error, or with a small probability a detour that lasts.
 
-A detour lengthens the way of one pair in one arrangement by N(0.3 m, 0.25 m), of which what is below zero hardly
-counts: nothing is shorter than the straight way, but for a gross error in a hundred. What share of rows has one is not
-known, a beta distribution beforehand. For given marks all is normal, so the likelihood of every other choice of marks
-that differs in one or two rows follows from one matrix, times the probability of each marked row that its detour is
-positive; a search takes the best of them until none is better. Choices nearly as likely as the best are kept with their
-weights (Occam's window: Madigan and Raftery, Journal of the American Statistical Association, 1994), so that intervals
-say when it is open which of two pairs is reflected.
+A detour lengthens the path of one pair in one arrangement by N(0.3 m, 0.25 m); negative values have a small weight,
+because only gross errors (one in a hundred) are shorter than the straight path. The share of rows with a detour is
+unknown, with a beta distribution as prior. For given marks all errors are normal. So the likelihood of every choice of
+marks that differs in one or two rows follows from one matrix, times the probability that the detour of each marked row
+is positive; a search takes the best change until none is better. Choices nearly as likely as the best are kept with
+their weights (Occam's window: Madigan and Raftery, Journal of the American Statistical Association, 1994), so that
+intervals include the uncertainty about which of two pairs is reflected.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from calib.surveys.network import EXTRA_M, EXTRA_STD_M, Case, Linear, Network
 from uwblink.arrays import Bools, Floats
 
 REFLECTED, STRAIGHT = 1.0, 30.0
-"""Rows with and without a detour that the prior of their share is worth: 3 % are reflected. Half or twice of either
-moves delays by 0.2 standard errors (`python -m benchmarks.constants`)."""
+"""Number of rows with and without a detour that the prior of their share counts for: 3 % are reflected. Half or twice
+of either moves delays by 0.2 standard errors (`python -m benchmarks.constants`)."""
 
 SHORTER_SHARE = 0.01
-"""Share of rows with a gross error that are shorter than the straight way: no detour is. It
-keeps logarithms finite."""
+"""Share of rows with a gross error, shorter than the straight path, which no detour explains. It keeps logarithms
+finite."""
 
 
 MAX_FIRST_CHANGES = 24
-"""How many single changes, the best ones, are tried together with a second one: half or
-twice as many change nothing (`python -m benchmarks.constants`)."""
+"""Number of best single changes that are tried together with a second one: half or twice as many do not change results
+(`python -m benchmarks.constants`)."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,11 @@ class Marks:
 
     @property
     def sign(self) -> Floats:
-        """What a change of each mark (n,) does to the number of marks."""
+        """The change of the number of marks by a change of each mark (n,)."""
         return np.where(self.marked, -1.0, 1.0)
 
     def penalties(self) -> Floats:
-        """Return -2 log of how much less likely each row (n,) is for its detour being positive, if it is marked."""
+        """Return -2 log of the probability that the detour of each row (n,) is positive, if it is marked."""
         own = np.diag(self.inverse)
         grown = np.where(self.marked, 1.0, 1 + EXTRA_STD_M**2 * own)
         own, pull = own / grown, (self.pull - np.where(self.marked, 0.0, EXTRA_M) * own) / grown
@@ -86,8 +86,8 @@ class Marks:
         """Return what a change of each mark (n,) adds to -2 log likelihood, with the row's penalty."""
         return np.asarray(self.plain_changes + self.sign * self.penalties())
 
-    def flipped(self, row: int) -> Marks:
-        """Return these marks with that of one row changed (by the formula of Sherman and Morrison)."""
+    def with_change(self, row: int) -> Marks:
+        """Return these marks with the mark of one row changed (by the formula of Sherman and Morrison)."""
         sign, column = self.sign[row], self.inverse[:, row]
         pull = self.pull - sign * EXTRA_M * column
         gain = sign * EXTRA_STD_M**2 / (1 + sign * EXTRA_STD_M**2 * column[row])
@@ -98,33 +98,35 @@ class Marks:
             self.plain + float(self.plain_changes[row]),
         )
 
-    def _near(self) -> Iterator[tuple[Marks, Floats]]:
-        """Yield these marks and those with one row changed, the best ones, with what one more change adds to these."""
+    def _neighbours(self) -> Iterator[tuple[Marks, Floats]]:
+        """Yield these marks and the best ones with one row changed, with the effect of one more change on each."""
         changes = self.changes()
         yield self, changes
         for row in np.argsort(changes, kind="stable")[:MAX_FIRST_CHANGES].tolist():
-            after = self.flipped(row)
+            after = self.with_change(row)
             more = changes[row] + after.changes()
             more[row] = math.inf
             yield after, more
 
-    def searched(self, steps: int = 40) -> Bools:
-        """Return the marks (n,) after changes of one or two rows at a time, those that gain most, until none gains."""
+    def search(self, steps: int = 40) -> Bools:
+        """Return the marks (n,) after changes of one or two rows at a time, always the best ones, until none is an
+        improvement.
+        """
         here = self
         for _ in range(steps):
-            after, more = min(here._near(), key=lambda one: float(one[1].min()))
+            after, more = min(here._neighbours(), key=lambda one: float(one[1].min()))
             if more.min() > -1e-6:
                 break
-            here = after.flipped(int(np.argmin(more)))
+            here = after.with_change(int(np.argmin(more)))
         return here.marked
 
     def window(self) -> tuple[list[Bools], Floats]:
-        """Return these marks and those, one or two rows away, that lie in the window, with weights that sum to 1."""
+        """Return these marks and those within one or two changes that lie in the window, with weights that sum to 1."""
         near = {self.marked.tobytes(): self}
-        for after, more in self._near():
-            # A choice counts with a twentieth of the weight of the best, or more.
+        for after, more in self._neighbours():
+            # Choices with less than a twentieth of the best weight are omitted.
             for row in np.flatnonzero(more < 2 * math.log(20.0)).tolist():
-                last = after.flipped(row)
+                last = after.with_change(row)
                 near[last.marked.tobytes()] = last
         kept = list(near.values())
         value = np.array([one.plain + float(one.penalties()[one.marked].sum()) for one in kept])
@@ -133,5 +135,7 @@ class Marks:
 
 
 def unlikely(count: int, rows: int) -> float:
-    """Return -2 log of the probability that just these rows are reflected, `count` of them, whatever the share."""
+    """Return -2 log of the probability that exactly these rows are reflected, `count` of them, integrated over the
+    share.
+    """
     return -2 * float(betaln(REFLECTED + count, STRAIGHT + rows - count) - betaln(REFLECTED, STRAIGHT))

@@ -35,7 +35,8 @@ ANCHORS = {
 
 @dataclass(frozen=True, slots=True)
 class SurveyedBoard:
-    """Where a tag's antenna was: metres, and the covariance (3, 3); zero along what the frame or the shape fixes.
+    """The position of a tag's antenna: metres, and the covariance (3, 3); zero along directions that the frame or the
+    shape fixes.
 
     `determined` is whether the ranges determine the place.
     """
@@ -48,7 +49,9 @@ class SurveyedBoard:
 
 @dataclass(frozen=True, slots=True)
 class SurveyedArrangement:
-    """An arrangement: its name, what was said of it ("line", "plane" or ""), its boards, and the frame in words."""
+    """An arrangement: its name, its stated shape ("line", "plane" or ""), its boards, and a description of
+    the frame.
+    """
 
     name: str
     known: str
@@ -83,7 +86,7 @@ class SurveyedArrangement:
 
 @dataclass(frozen=True, slots=True)
 class SecondBest:
-    """The best other solution: in which arrangement it differs, whose places, how much worse its -2 log likelihood."""
+    """The best other solution: the arrangement in which it differs, its tags, and the increase of -2 log likelihood."""
 
     arrangement: str
     tags: tuple[int, ...]
@@ -91,14 +94,14 @@ class SecondBest:
 
     @property
     def ambiguous(self) -> bool:
-        """Whether the ranges can hardly tell it from the best one."""
+        """Whether the ranges hardly distinguish it from the best one."""
         # Three standard deviations of one value, in -2 log likelihood.
         return self.worse < 9.0
 
 
 @dataclass(frozen=True, slots=True)
 class ReflectedPair:
-    """A pair that is believed to be reflected in an arrangement: by how much its range is off, and how probable it is.
+    """A pair that is probably reflected in an arrangement: the error of its range, and the probability.
 
     `chance` below a half is for one that may be reflected instead of another.
     """
@@ -128,10 +131,10 @@ class ReflectedPair:
 class SurveyResult(CalibrationResult):
     """The result of `survey`: a calibration, and the positions of the boards.
 
-    `pair_error_m` is the constant error that a pair has in an arrangement, as a standard deviation; `verdict` says what
-    of the delays (in ns) is determined; `contradictions` are those between the ranges and what was said to be
-    known; `warnings` what a user should know. `second_best` is the best other solution, `reflected` are
-    pairs that are, or may be, reflected.
+    `pair_error_m` is the constant error that a pair has in an arrangement, as a standard deviation; `verdict` states
+    which delays (in ns) are determined; `contradictions` are findings between the ranges and stated facts; `warnings`
+    are sentences for the user. `second_best` is the best other solution, `reflected` are pairs that are, or may be,
+    reflected.
 
     >>> import calib
     >>> result = calib.survey(calib.sample_arrangements(), known="line")
@@ -154,7 +157,7 @@ class SurveyResult(CalibrationResult):
         return tuple(map(str, self.contradictions))
 
     def headline(self) -> str:
-        """Return what the survey rests on, in one line."""
+        """Return the inputs of the survey, in one line."""
         count = len(self.arrangements)
         pairs = self.calibration.provenance["pairs"]
         return (
@@ -165,9 +168,9 @@ class SurveyResult(CalibrationResult):
     def save_anchors(
         self, path: str | os.PathLike[str], *, arrangement: str | None = None, force: bool = False
     ) -> None:
-        """Write where boards stood: `[[anchors]]` (.toml) or parameters for ROS (.yaml), with covariance.
+        """Write the places of boards: `[[anchors]]` (.toml) or parameters for ROS (.yaml), with covariance.
 
-        `arrangement` names which, where there are several. Raises `BadInputError`.
+        `arrangement` names one of several. Raises `BadInputError`.
         """
         place, one = Path(path), self.arrangement(arrangement)
         if place.suffix.lower() not in ANCHORS:
@@ -183,7 +186,7 @@ class SurveyResult(CalibrationResult):
         write_text(place, text, force=force)
 
     def save_picture(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Draw where boards stood, with the ellipses that hold them with 95 %, as .svg, .png or .pdf.
+        """Draw the places of boards with their 95 % ellipses, as .svg, .png or .pdf.
 
         Raises `BadInputError` for another suffix.
         """

@@ -1,8 +1,8 @@
-"""The solution of a network: where a search begins, the likeliest unknowns, the sizes of errors, and other solutions.
+"""The solution of a network: the start of a search, the likeliest unknowns, the sizes of errors, and other solutions.
 
-A search begins at a multidimensional scaling of the ranges. Boards may be said to stand in an order on a line: a line
-has no beginning, so an order and its reverse are the same, and boards nearer to each other than 10 cm may stand in
-either order, because nobody can say who is first of two side by side.
+A search begins at a multidimensional scaling of the ranges. The order of boards on a line may be stated: an order and
+its reverse are the same, because a line has no first end, and boards within 10 cm of each other may be in either order,
+because they are side by side.
 
 For given errors `calib.estimator.optimize` finds the unknowns. The constant error of pairs and the spread of the curve
 maximise the likelihood integrated over the unknowns (restricted maximum likelihood: Patterson and Thompson, Biometrika,
@@ -37,24 +37,25 @@ SHAKEN = 4
 
 
 def is_in_order(coordinates: Floats) -> bool:
-    """Return whether coordinates (n,), those of boards in the order that is said, rise or fall."""
+    """Return whether coordinates (n,) of boards in their stated order increase or decrease throughout."""
     ways = coordinates, coordinates[::-1]
-    # Boards nearer to each other than 10 cm stand side by side: they touch, and their order means nothing.
+    # Boards within 10 cm of each other are side by side: they touch, and their order has no meaning.
     return any(float(np.max(np.maximum.accumulate(v) - v)) <= 0.1 for v in ways)
 
 
-def exchanged_boards(said: Sequence[int], coordinates: Floats) -> set[tuple[int, int]]:
-    """Return which two boards must change places for those `said`, at coordinates (n,), to be in order; or nothing.
+def exchanged_boards(stated: Sequence[int], coordinates: Floats) -> set[tuple[int, int]]:
+    """Return two boards that must change places so that the boards `stated`, at coordinates (n,), are in order; or
+    nothing.
 
-    More than one pair where the ranges cannot tell: 1-2-3-4 with the inner two exchanged is the same with the outer two
-    exchanged, from the other end.
+    Returns more than one pair if the ranges do not distinguish them: 1-2-3-4 with the inner two exchanged is the same
+    as with the outer two exchanged, from the other end.
     """
     fitting = set()
-    for i, j in combinations(range(len(said)), 2):
+    for i, j in combinations(range(len(stated)), 2):
         changed = coordinates.copy()
         changed[[i, j]] = coordinates[[j, i]]
         if is_in_order(changed):
-            fitting.add((min(said[i], said[j]), max(said[i], said[j])))
+            fitting.add((min(stated[i], stated[j]), max(stated[i], stated[j])))
     return fitting
 
 
@@ -69,7 +70,7 @@ def first_start(network: Network, delays: Floats | None = None) -> Floats:
         here = network.seats(k)
         rows = np.flatnonzero(np.isin(network.ends[: len(network.means.range_m), 0], here))
         ends, length = np.searchsorted(here, network.ends[rows]), np.maximum(measured[rows], 0.01)
-        # A derivative by a coordinate of which all are zero would be zero.
+        # The derivative by a coordinate that is zero for all boards would be zero.
         found = scaled_places(ends, length, len(here), boards.dimensions, least_m2=1e-6)
         known = [n for n, point in enumerate(here.tolist()) if point in network.known_places]
         if known:
@@ -81,7 +82,9 @@ def first_start(network: Network, delays: Floats | None = None) -> Floats:
 
 
 def other_starts(points: Floats, boards: Boards, seed: int) -> Iterator[Floats]:
-    """Yield other places (n, 3) of boards: neighbours exchanged, in the order that is said, mirrored, or shaken."""
+    """Yield other places (n, 3) of boards: neighbours exchanged, in the stated order, mirrored, or randomly
+    displaced.
+    """
     if boards.order:
         rows = [boards.tags.index(tag) for tag in boards.order]
         upward = points[sorted(rows, key=lambda row: float(points[row, 0]))]
@@ -93,7 +96,7 @@ def other_starts(points: Floats, boards: Boards, seed: int) -> Iterator[Floats]:
     middle = points - points.mean(axis=0)
     _, size, axes = np.linalg.svd(middle)
     if boards.dimensions > 1:
-        # Through the plane in which boards nearly lie: what is on its one side might be on its other.
+        # Mirrored at the plane in which boards nearly lie: a board on one side might be on the other.
         normal = axes[boards.dimensions - 1]
         yield points - 2 * np.outer(middle @ normal, normal)
     rng, spread = np.random.default_rng(seed), max(float(size[0]) / np.sqrt(len(points)), 0.1)
@@ -114,21 +117,21 @@ Half or twice of either moves delays beside reflections by 0.29 standard errors,
 
 
 CURVE_STD_M, CURVE_FACTOR = 0.1, 1.7
-"""Prior standard deviation of a curve, and the factor by which that may be wrong (`CURVE_LENGTH_DB`)."""
+"""Prior standard deviation of a curve, and the factor of its uncertainty (`CURVE_LENGTH_DB`)."""
 
 
 MAX_WORSE_ALONE = 60.0
-"""By how much -2 log likelihood of one arrangement's other solution may be worse for all to be solved with it:
-half or twice of it changes nothing (`python -m benchmarks.constants`)."""
+"""Maximum increase of -2 log likelihood of one arrangement's other solution for which the whole network is solved with
+it: half or twice of it does not change results (`python -m benchmarks.constants`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """The best unknowns `x` (p,) of a network, and the errors that go with them.
+    """The best unknowns `x` (p,) of a network, and their errors.
 
-    `unlikely` is -2 log of the likelihood of everything, up to a constant that all solutions of one set of means share.
-    `chance` (n,) is how probable it is of each mean that it is reflected, and `more` (p, p) what it adds to the
-    covariance that others may be reflected, or spreads be others.
+    `unlikely` is -2 log of the total likelihood, up to a constant that all solutions of one set of means share.
+    `chance` (n,) is the probability of each mean of being reflected, and `more` (p, p) the covariance that is added
+    because other means may be reflected, or spreads may differ.
     """
 
     network: Network
@@ -151,16 +154,16 @@ class Solution:
 
     @property
     def freedom(self) -> float:
-        """The degrees of freedom that are left: rows less those that unknowns use up."""
+        """The remaining degrees of freedom: the number of rows minus the effective number of unknowns."""
         return float(len(self.linear.left) - np.sum(self.linear.covariance * self.linear.information))
 
     def covariance(self) -> Floats:
-        """Return the covariance (p, p), with the priors of delays, so that there is always one."""
+        """Return the covariance (p, p), with the priors of delays, so that it always exists."""
         return np.asarray(self.linear.covariance + self.more)
 
     def information(self) -> Floats:
-        """Return the information (p, p) of what was measured and of what is known."""
-        # Of the sum of two covariances, the first of which may be infinite.
+        """Return the information (p, p) of measurements and known facts."""
+        # The inverse of the sum of two covariances, the first of which may be infinite.
         wider = np.linalg.solve(np.eye(len(self.x)) + self.linear.known @ self.more, self.linear.known)
         return np.asarray((wider + wider.T) / 2)
 
@@ -187,16 +190,16 @@ def of_spreads(network: Network, x: Floats, case: Case) -> float:
 
 
 def unlikelihood(network: Network, x: Floats, case: Case) -> float:
-    """Return the same with how unlikely the reflections and the order of the boards are."""
+    """Return the same plus -2 log probability of the reflections and of the order of the boards."""
     value = of_spreads(network, x, case) + unlikely(int(case.marks.sum()), len(case.marks))
     if case.marks.any():
         value += float(Marks.at(network, x, case).penalties()[case.marks].sum())
-    # One in a hundred stands in another order than somebody said who put the boards so.
+    # One stated order in a hundred is wrong.
     return value + 2 * math.log(100.0) * len(out_of_order(network, x))
 
 
 def out_of_order(network: Network, x: Floats) -> list[int]:
-    """Return the arrangements in which boards do not stand in the order that is said."""
+    """Return the arrangements in which boards are not in the stated order."""
     points = network.positions_m(x)
     return [
         k
@@ -205,11 +208,11 @@ def out_of_order(network: Network, x: Floats) -> list[int]:
     ]
 
 
-def settle(network: Network, x: Floats, case: Case) -> tuple[Floats, Case]:
-    """Return the unknowns from a start, and the case with the means that are likeliest reflected."""
+def find_reflected_means(network: Network, x: Floats, case: Case) -> tuple[Floats, Case]:
+    """Return the unknowns from a start, and the case with the likeliest reflected means."""
     for _ in range(2):
         x, _ = optimize(network, x, case)
-        before, case = case.marks, replace(case, marks=Marks.at(network, x, case).searched())
+        before, case = case.marks, replace(case, marks=Marks.at(network, x, case).search())
         if np.array_equal(before, case.marks):
             return x, case
     return optimize(network, x, case)[0], case
@@ -218,16 +221,16 @@ def settle(network: Network, x: Floats, case: Case) -> tuple[Floats, Case]:
 def adjust(
     network: Network, x: Floats, *, marks: Bools | None = None, start_m: float = PAIR_STD_M, rounds: int = 6
 ) -> Solution:
-    """Return the best unknowns from a start, with the spreads and the reflected means estimated along, in turns.
+    """Return the best unknowns from a start, with the spreads and the reflected means estimated alternately.
 
-    `start_m` is the constant error of pairs at first, where that is not known, and `marks` (n,) are the means that are
-    reflected at first.
+    `start_m` is the start value of the constant error of pairs, if this is unknown, and `marks` (n,) are the reflected
+    means at the start.
     """
     none = np.zeros(len(network.means.range_m), dtype=bool)
     case = Case(none if marks is None else marks, network.pair_m or start_m, CURVE_STD_M)
     for _ in range(rounds):
         before = case
-        x, case = settle(network, x, case)
+        x, case = find_reflected_means(network, x, case)
         case = _spreads(network, x, case)
         if abs(case.pair_m - before.pair_m) < 0.02 * case.pair_m and np.array_equal(case.marks, before.marks):
             break
@@ -259,27 +262,29 @@ def _spreads(network: Network, x: Floats, case: Case) -> Case:
 
 
 def averaged(found: Solution) -> Solution:
-    """Return the mean over what is nearly as likely, with the covariance that the other possibilities add.
+    """Return the mean over nearly equally likely cases, with the covariance that the other cases add.
 
     These are other choices of reflected means and, where there is a curve, other spreads of pairs and curve: few pairs
-    say little of how large a curve is, and what all delays share depends on it.
+    determine the size of a curve poorly, and the common part of all delays depends on it.
     """
     network, x, case = found.network, found.x, found.case
     marks, weight = Marks.at(network, x, case).window()
-    mean, more = _mixed(found, [replace(case, marks=one) for one in marks], weight)
+    mean, more = _average_cases(found, [replace(case, marks=one) for one in marks], weight)
     if network.curve is not None:
-        # Steps of logarithms of about half of what a survey knows of either.
+        # Steps of logarithms, about half of the standard error of either in a survey.
         steps = [(0.3 * i, 0.4 * k) for i in range(-2, 3) for k in range(-4, 5) if network.pair_m is None or not i]
         cases = [case.scaled(*step) for step in steps]
         worse = np.array([of_spreads(network, x, one) for one in cases])
         likely = np.exp(-0.5 * (worse - worse.min()))
-        step, wider = _mixed(found, cases, likely / likely.sum())
+        step, wider = _average_cases(found, cases, likely / likely.sum())
         mean, more = mean + step, more + wider
     return replace(found, x=x + mean, chance=weight @ np.array(marks), more=more)
 
 
-def _mixed(found: Solution, cases: Sequence[Case], weight: Floats) -> tuple[Floats, Floats]:
-    """Return the mean step over cases, linear, and what their covariance is more than that of one case, not below 0."""
+def _average_cases(found: Solution, cases: Sequence[Case], weight: Floats) -> tuple[Floats, Floats]:
+    """Return the mean step over linearized cases, and the excess of their covariance over the covariance of one case,
+    at least 0.
+    """
     every = [Linear(found.network, found.x, case) for case in cases]
     steps = np.array([one.step for one in every])
     mean = weight @ steps
@@ -289,18 +294,18 @@ def _mixed(found: Solution, cases: Sequence[Case], weight: Floats) -> tuple[Floa
 
 
 def solve(network: Network, *, moves: int = 6) -> tuple[Solution, SecondBest | None]:
-    """Return the best solution that any start leads to, and the second-best."""
+    """Return the best solution from all starts, and the second-best."""
     start, least = first_start(network), attrgetter("unlikely")
-    # With small errors of pairs too much looks reflected at first, with large ones too little.
+    # With small errors of pairs too many means seem reflected at first, with large ones too few.
     spreads = (0.01, 0.015, 0.02, 0.03, 0.045, 0.07) if network.pair_m is None else (network.pair_m,)
     found = min((adjust(network, start, start_m=spread) for spread in spreads), key=least)
-    # Once more with the delays that came out: the first guess of places was made without any.
+    # Again with the estimated delays: the first guess of places was made without delays.
     found = min(found, adjust(network, first_start(network, found.delays)), key=least)
     worse: list[SecondBest] = []
     for _ in range(moves):
         here = unlikelihood(network, found.x, found.case)
         others = [other for k in range(len(network.arrangements)) for other in _other_solutions(found, k)]
-        # Rounded, so that of mirror images the same one is named on every machine.
+        # Rounded, so that every machine chooses the same one of mirror images.
         worse = [
             SecondBest(*who, max(0.0, round(value - here, 3))) for value, _, _, who in others if value > here - 1e-3
         ]
@@ -315,7 +320,7 @@ def solve(network: Network, *, moves: int = 6) -> tuple[Solution, SecondBest | N
 def _other_solutions(
     found: Solution, arrangement: int
 ) -> Iterator[tuple[float, Floats, Case, tuple[str, tuple[int, ...]]]]:
-    """Yield other solutions that differ in one arrangement: how likely, unknowns, errors, and who is elsewhere."""
+    """Yield other solutions that differ in one arrangement: likelihood, unknowns, errors, and the displaced boards."""
     network, boards, seats = found.network, found.network.arrangements[arrangement], found.network.seats(arrangement)
     alone, mine = network.alone(arrangement), network.means.arrangement == arrangement
     case = replace(found.case, marks=found.case.marks[mine])
@@ -324,14 +329,14 @@ def _other_solutions(
     most, seen = unlikelihood(alone, found.x, case) + MAX_WORSE_ALONE, [_signature(network, found.x, seats)]
     for points in other_starts(network.positions_m(found.x)[seats], boards, seed=arrangement):
         start = network.with_positions(found.x, points, seats)
-        x, own = settle(alone, start, replace(case, marks=np.zeros_like(case.marks)))
+        x, own = find_reflected_means(alone, start, replace(case, marks=np.zeros_like(case.marks)))
         mark = _signature(network, x, seats)
         if unlikelihood(alone, x, own) > most or any(np.abs(mark - one).max() < least_m for one in seen):
             continue
         seen.append(mark)
         marks = found.case.marks.copy()
         marks[mine] = own.marks
-        x, whole = settle(network, x, replace(found.case, marks=marks))
+        x, whole = find_reflected_means(network, x, replace(found.case, marks=marks))
         change = np.abs(_signature(network, x, seats) - seen[0]).max(axis=1)
         if change.max() >= least_m:
             tags = np.array(boards.tags)[change > max(least_m, 0.5 * change.max())]
@@ -339,7 +344,9 @@ def _other_solutions(
 
 
 def _signature(network: Network, x: Floats, seats: Ints) -> Floats:
-    """Return what tells solutions of an arrangement apart (points, k): distances, and places where a frame is known."""
+    """Return the features (points, k) that distinguish solutions of an arrangement: distances, and places if a frame is
+    known.
+    """
     place = network.positions_m(x)[seats]
     apart = np.linalg.norm(place[:, None] - place, axis=2)
     return np.hstack([apart, place]) if network.known_places.keys() & set(seats.tolist()) else apart

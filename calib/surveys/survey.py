@@ -3,8 +3,8 @@
 Each check (wrong known distances, wrong shapes, exchanged labels) compares hypotheses of a fault with the survey as
 described, each with the reflections that fit it best: a few reflected pairs can look like a string that is not
 straight. The statistic is the ratio of the likelihoods, integrated over the unknowns; by Markov's inequality it exceeds
-1/p with a probability of at most p where nothing is wrong. The likeliest hypothesis is taken first, because a wrong
-tape makes other things look wrong, too.
+1/p with a probability of at most p if there is no fault. The likeliest hypothesis is accepted first, because a wrong
+tape makes other facts seem wrong, too.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def _distances(found: Solution) -> Iterator[tuple[str, Solution]]:
 
 
 def _shapes(found: Solution) -> Iterator[tuple[str, Solution]]:
-    """Yield the solution with each arrangement beside the line, or plane, that it is said to be on."""
+    """Yield the solution with each arrangement outside its stated line or plane."""
     network = found.network
     for k, boards in enumerate(network.arrangements):
         if boards.dimensions == 3 or len(boards.tags) < boards.dimensions + 2 or boards.freed:
@@ -77,7 +77,7 @@ def _shapes(found: Solution) -> Iterator[tuple[str, Solution]]:
         freed = replace(network, arrangements=tuple(arrangements))
         seats, beside = network.seats(k), boards.dimensions
         place = freed.positions_m(first_start(freed, found.delays))[seats]
-        # Where scaling finds nothing beside the line, a derivative there would be zero: boards begin 15 cm beside it.
+        # If scaling puts all boards on the line, the derivative beside it would be zero: boards start 15 cm beside it.
         if np.ptp(place[:, beside]) < 0.15:
             place[:, beside] += np.where(np.arange(len(seats)) % 2, 0.15, -0.15)
         marks = found.case.marks & (network.means.arrangement != k)
@@ -92,16 +92,18 @@ def _shapes(found: Solution) -> Iterator[tuple[str, Solution]]:
 
 
 def _exchanged(found: Solution) -> Iterator[tuple[str, Solution]]:
-    """Yield the solution with two tags exchanged in what is known, where something known is off or reflected."""
+    """Yield the solution with two tags exchanged in the known facts, if a known fact has a large residual or is
+    reflected.
+    """
     network, here, count = found.network, found.linear, len(found.network.means.range_m)
     rows = here.jacobian[count:]
-    # Residuals of what is known vary less than it does by what the fit makes of it.
+    # Residuals of known facts vary less than the facts, by the variance of the fit.
     off = list(here.left[count:] / np.sqrt(np.maximum(1 - np.diag(rows @ here.covariance @ rows.T), 1e-6)))
     for point, (place, sigma) in network.known_places.items():
         own = np.arange(3 * point, 3 * point + 3)
         off += list((found.x[own] - place) / np.sqrt(np.maximum(sigma**2 - here.covariance[own, own], 1e-12)))
-    # Labels are tested where something known is off by three standard deviations. By chance 0.3 % are, which cost time
-    # only, because the test of labels has its own level.
+    # Labels are tested if a known fact is off by three standard deviations. By chance 0.3 % are, which only costs time,
+    # because the test of labels has its own level.
     if not (np.abs(off).max(initial=0.0) > 3.0 or (off and found.case.marks.any())):
         return
     involved = {tag for one in network.distances for tag in (one.first, one.second)}
@@ -124,13 +126,13 @@ HYPOTHESES = {
     ),
     "exchanged labels": (_exchanged, "check the labels of these two boards"),
 }
-"""The checks by the fault: the hypotheses, and what to do where one is true."""
+"""The checks by fault: the hypotheses, and the remedy if one is true."""
 
 
 def wrong_orders(found: Solution) -> Iterator[Finding]:
     """Yield the contradictions between the stated orders of boards on a line and the ranges.
 
-    What several arrangements have in common is one contradiction.
+    A common contradiction of several arrangements is one contradiction.
     """
     network, points = found.network, found.network.positions_m(found.x)
     spots = {}
@@ -144,13 +146,13 @@ def wrong_orders(found: Solution) -> Iterator[Finding]:
         pair = max(common, key=common.__getitem__, default=None)
         same = [k for k, some in pairs.items() if pair in some] or list(pairs)[:1]
         both = set.intersection(*(pairs.pop(k) for k in same))
-        said = network.arrangements[same[0]].order
-        seen = [said[n] for n in np.argsort(spots[same[0]]).tolist()]
+        stated = network.arrangements[same[0]].order
+        seen = [stated[n] for n in np.argsort(spots[same[0]]).tolist()]
         where = ", ".join(network.arrangements[k].name for k in same)
         words = ", or ".join(f"{i} and {j}" for i, j in sorted(both))
         what = f"boards {words} are exchanged" if both else "boards stand in another order than stated"
         text = (
-            f"{where}: {what}: the stated order is {'-'.join(map(str, said))}, but by the ranges of "
+            f"{where}: {what}: the stated order is {'-'.join(map(str, stated))}, but by the ranges of "
             f"{network.arrangements[same[0]].name} it is {'-'.join(map(str, seen))}"
         )
         yield Finding("exchanged labels", text, "check their labels", BUDGET)
@@ -159,14 +161,14 @@ def wrong_orders(found: Solution) -> Iterator[Finding]:
 def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, **changes: Any) -> SurveyResult:
     """Estimate delays, the power curve and positions of boards that stood still, from their ranges only.
 
-    `data` is what `load_ranges` takes; true distances are not needed and not looked at. Arrangements are those that
+    `data` is the same as for `load_ranges`; true distances are not needed and not used. Arrangements are those that
     recordings mark (`uwblink record --arrangement`), those whose times `known` gives, or stretches in which nothing
-    moves. `settings` and keyword arguments named like its fields (`SurveySettings`, which explains them) say what is
-    known and what is fitted.
+    moves. `settings` and keyword arguments named like its fields (`SurveySettings`, which explains them) state known
+    facts and what is fitted.
 
-    The result holds only delays that the arrangements determine. Raises `UnanswerableError` where none is, with the
-    reason, and where ranges contradict what is said to be known (a line that is none, a board that was moved, exchanged
-    labels, a wrong distance), unless `regardless`; `BadInputError` for arguments that cannot be used.
+    The result holds only delays that the arrangements determine. Raises `UnanswerableError` if none is, with the
+    reason, and if ranges contradict stated facts (boards that are not on a line, a moved board, exchanged labels, a
+    wrong distance), unless `regardless`; `BadInputError` for arguments that cannot be used.
 
     >>> import calib
     >>> result = calib.survey(calib.sample_arrangements(), known="line")
@@ -176,7 +178,7 @@ def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, 
     """
     asked = replace(settings or SurveySettings(), **changes)
     knowledge, taken = _knowledge(asked.known), _checked_curve(asked.curve_from)
-    # Small matrices: several threads make them slower, and the last digits another.
+    # Small matrices: several threads are slower, and change the last digits.
     with threadpool_limits(limits=1, user_api="blas"):
         gathered = read_surveys(data, knowledge)
         if taken is not None:
@@ -184,7 +186,7 @@ def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, 
         network = network_of(gathered, knowledge, asked.fixed_ns, curve=not asked.delays_only and taken is None)
         found, second = solve(replace(network, pair_m=asked.pair_error_m))
         findings = list(gathered.findings)
-        # After findings of 15 % of the means no more is looked for.
+        # After findings of 15 % of the means the search ends.
         most = len(findings) + max(1, int(0.15 * len(network.means.range_m)))
         while len(findings) < most and (fault := likeliest_fault(found)):
             finding, found = fault
@@ -209,9 +211,9 @@ def _knowledge(known: Knowledge | str | os.PathLike[str]) -> Knowledge:
 
 
 def _checked_curve(curve_from: Calibration | str | os.PathLike[str] | None) -> Calibration | None:
-    """Return the calibration whose curve is taken over.
+    """Return the calibration whose curve is used.
 
-    Raises `BadInputError` for one of another lifting, and for one that has no curve.
+    Raises `BadInputError` for a calibration with another lifting, or without a curve.
     """
     known = None if curve_from is None else given_calibration(curve_from, "curve_from")
     if known is not None and (known.lift != LIFT or known.alpha_dbm != ALPHA_DBM):
@@ -223,7 +225,7 @@ def _checked_curve(curve_from: Calibration | str | os.PathLike[str] | None) -> C
 
 
 def _less_curve(gathered: SurveyData, curve: Curve) -> SurveyData:
-    """Return the means less a curve, with a warning of powers that it was not fitted at."""
+    """Return the means minus a curve, with a warning about powers outside its fitted range."""
     means = gathered.means
     if not np.isfinite(means.lifted).all():
         raise UnanswerableError("some pairs have no power, so no curve can be applied (`curve_from`)")
@@ -234,7 +236,7 @@ def _less_curve(gathered: SurveyData, curve: Curve) -> SurveyData:
 
 
 def network_of(gathered: SurveyData, knowledge: Knowledge, fixed_ns: Mapping[int, float], *, curve: bool) -> Network:
-    """Return the network of means and of what is known beside them."""
+    """Return the network of means and known facts."""
     means, arrangements = gathered.means, list[Boards]()
     tags = [tuple(np.unique(means.ends[means.arrangement == k]).tolist()) for k in range(len(gathered.arrangements))]
     check_knowledge(knowledge, {one.name: set(own) for one, own in zip(gathered.arrangements, tags, strict=True)})
@@ -273,16 +275,16 @@ def network_of(gathered: SurveyData, knowledge: Knowledge, fixed_ns: Mapping[int
 
 
 def sample_arrangements(count: int = 6, *, seed: int = 1) -> Ranges:
-    """Return ranges of four boards on a string in `count` orders (at most 6), each held for 30 s, 20 ranges a second.
+    """Return ranges of four boards on a string in `count` orders (at most 6), each for 30 s with 20 ranges per second.
 
     Antenna delays are -0.3, 0.1, -0.1 and 0.2 ns; a pair has a constant error of 1 cm in an arrangement, a range noise
-    of 3 cm. No true distance is in it. The same seed gives the same ranges.
+    of 3 cm. It contains no true distances. The same seed gives the same ranges.
 
     >>> import calib
     >>> calib.sample_arrangements(2)
     <Ranges of memory: 1200 of tags 1, 2, 3, 4>
     """
-    # Tags from left to right; every two tags are neighbours somewhere, and each is somewhere in the middle.
+    # Tags from left to right; any two tags are neighbours in some order, and each is in the middle in some order.
     orders = ((1, 2, 3, 4), (2, 1, 4, 3), (3, 1, 4, 2), (2, 4, 1, 3), (4, 3, 2, 1), (1, 3, 4, 2))
     rng, held = np.random.default_rng(seed), 600
     pairs = np.array(list(combinations(orders[0], 2)))
@@ -295,7 +297,7 @@ def sample_arrangements(count: int = 6, *, seed: int = 1) -> Ranges:
         error = 0.01 * rng.normal(size=len(pairs))
         mean = np.abs(np.diff(place[pairs])[:, 0]) - 0.5e-9 * SPEED_OF_LIGHT * delays + error
         raw.append(mean[pair] + 0.03 * rng.normal(size=held))
-    # Ten seconds between two arrangements.
+    # There are ten seconds between two arrangements.
     time_s = [40.0 * k + np.arange(held) / 20.0 for k in range(len(raw))]
     tags = np.tile(pairs[pair], (len(raw), 1))
     return Ranges.from_arrays(

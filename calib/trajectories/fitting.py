@@ -19,7 +19,7 @@ from calib.checks.limits import refuse_refuted
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.inverse import Matrix, inverse_of
-from calib.estimator.known_distances import Fitted, KnownDistances, described, model_of
+from calib.estimator.known_distances import Fitted, KnownDistances, model_of, with_covariances
 from calib.estimator.losses import MIXTURE
 from calib.estimator.range_model import BOARD_DELAY_STD_NS, METRES_A_NS, RangeModel
 from calib.estimator.rows import sum_rows
@@ -46,7 +46,7 @@ COMMON_SETTINGS = (
     "delays_only",
     "between_m",
 )
-"""The settings of `fit` that a fit without known distances has, too."""
+"""The settings of `fit` that a fit without known distances also has."""
 
 
 def fit_from_ranges(
@@ -59,23 +59,24 @@ def fit_from_ranges(
 ) -> FitResult:
     """Fit antenna delays and curves to the ranges of moving bodies whose trajectories are not known.
 
-    `data` is one recording with the tags' bodies and lever arms. `flight` says what is known of the flight; `settings`
-    are those of `fit`, of which `COMMON_SETTINGS` apply; keyword arguments are named like the fields of either.
+    `data` is one recording with the tags' bodies and lever arms. `flight` states what is known of the flight;
+    `settings` are the settings of `fit`, of which `COMMON_SETTINGS` apply; keyword arguments have the names of fields
+    of either.
 
-    The bodies' positions are taken from the recording's poses during the first `poses_until_s` seconds (all there are,
-    by default). Elsewhere they are estimated from the ranges, together with delays and curve. `attitudes` come from the
-    "poses", all along; from the "imu", which begins with the poses' attitude; or there are "none". Headings have errors
-    of `heading_std_deg` that wander; 0 takes attitudes as exact. Bodies whose poses stay in one place are anchors;
-    their positions (`anchors`) are "given", or "sought" (estimated). `distances` by tape are used beside those that
-    the recording states: between anchors, or between moving bodies while they stood still, in an arrangement of the
+    The bodies' positions are taken from the recording's poses during the first `poses_until_s` seconds (by default from
+    all poses). At other times they are estimated from the ranges, together with delays and curve. `attitudes` come from
+    the "poses" throughout; from the "imu", starting with the poses' attitude; or there are "none". Headings have slowly
+    varying errors of `heading_std_deg`; 0 takes attitudes as exact. Bodies whose poses stay in one place are anchors;
+    their positions (`anchors`) are "given", or "sought" (estimated). `distances` by tape are used in addition to those
+    in the recording: between anchors, or between moving bodies while they stood still, in an arrangement of the
     recording or a span of seconds since the first range ("2..8"). `heights` of the recording's sensors are "used" or
-    "ignored". `curve_from` is a calibration, or its path, whose curve is kept, with its lift and reference power; its
-    uncertainty is in the intervals of the delays.
+    "ignored". `curve_from` is a calibration, or its path, whose curve is kept, with its lift and reference power;
+    intervals of the delays include its uncertainty.
 
     The result is what `fit` returns; the truth of its `ranges` is the estimated distances. `UnanswerableError` is
-    raised where no delay is determined, unless `minimum_norm` asks for the delays nearest to zero; delays that are not
-    determined have infinite standard errors. `progress` is called with the done fraction, 0 to 1. Raises
-    `BadInputError` for a setting that cannot be used.
+    raised if no delay is determined, unless `minimum_norm` selects the delays nearest to zero; undetermined delays have
+    infinite standard errors. `progress` is called with the completed fraction, 0 to 1. Raises `BadInputError` for a
+    setting that cannot be used.
 
     >>> import calib
     >>> result = calib.fit_from_ranges(calib.sample_flight(450), poses_until_s=3.0)
@@ -84,16 +85,16 @@ def fit_from_ranges(
     '0.4 ns, planted 0.4 ns'
     """
     flight, settings, known = _settings(flight, settings, changes)
-    # Three tenths of the work are done when the search has its initial guess.
+    # Three tenths of the work are complete with the initial guess of the search.
     report, begun = progress or (lambda _: None), 0.3
     scene = scene_from(data, flight, need_power=not settings.delays_only)
-    # One thread: the same bytes on any machine.
+    # One thread gives the same bytes on any machine.
     with threadpool_limits(limits=1, user_api="blas"):
         model, scene = range_model(scene, settings, curve=not settings.delays_only and known is None)
         scene, state, rival = begin(scene, lambda share: report(begun * share))
         error = model.ranges.raw_m if known is None else model.ranges.raw_m - known.bias_curve(model.lifted)
         top = search(scene, model, error, state, lambda share: report(begun + (1 - begun) * share))
-        result = _result(_described(model, top, known), top, flight, settings, known, rival)
+        result = _result(_fit_to_estimated_distances(model, top, known), top, flight, settings, known, rival)
     report(1.0)
     return result
 
@@ -126,14 +127,14 @@ def _settings(
 
 def range_model(scene: Scene, settings: FitSettings, *, curve: bool, offsets: bool = True) -> tuple[RangeModel, Scene]:
     """Return the model of delays, curves and offsets, and the scene with the ranges that the model keeps."""
-    # The truth is not known. In its place stands the number of the row, which says what rows the model keeps.
+    # True distances are unknown. The row numbers in their place tell which rows the model keeps.
     numbered = replace(scene.ranges, truth_m=np.arange(len(scene.ranges), dtype=np.float64))
     model = model_of(numbered, replace(settings, delays_only=not curve), offsets=offsets)
     return model, scene.only(model.ranges.truth_m.astype(np.int64))
 
 
-def _described(model: RangeModel, top: Search, known: Calibration | None) -> KnownDistances:
-    """Return the fit as one to the estimated distances, whose uncertainty is in its covariance."""
+def _fit_to_estimated_distances(model: RangeModel, top: Search, known: Calibration | None) -> KnownDistances:
+    """Return the result as a fit to the estimated distances; its covariance includes their uncertainty."""
     distances = top.geometry.distances(top.optimum.x)[0]
     model = replace(model, ranges=replace(model.ranges, truth_m=distances))
     fitted = Fitted(
@@ -146,8 +147,9 @@ def _described(model: RangeModel, top: Search, known: Calibration | None) -> Kno
         steps=top.steps,
         beside=tuple(top.known.values()),
     )
-    # What the pairs leave free is known; the rest is judged later, with the uncertainty of trajectories.
-    found = described(model, fitted, time_blocks(model.ranges.time_ns, model.ranges.session))
+    # Combinations that pairs do not determine are known; the others are judged later, with the uncertainty of
+    # trajectories.
+    found = with_covariances(model, fitted, time_blocks(model.ranges.time_ns, model.ranges.session))
     if known is not None:
         more = found.covariances["delay"] + _curve_uncertainty(found, known)
         found = replace(found, covariances=found.covariances | {"delay": more})
@@ -177,7 +179,7 @@ def _result(
     covariance, findings = examine_fit(found)
     covariance = variance_factor(scene) * covariance
     own, verdict = _judge_delays(found, top)
-    # Splits that the pairs leave undetermined are held, so that the covariance has nothing along them.
+    # Splits that the pairs do not determine are fixed, so the covariance is zero along them.
     free = [int(tag) for tag in verdict.named("delay") if tag]
     left_open = _undetermined_text(free, [model.tags[k] for k in own], covariance[np.ix_(own, own)], model.free)
     if free and len(free) == len(own) and not flight.minimum_norm:
@@ -242,11 +244,11 @@ def _provenance(found: KnownDistances, top: Search, flight: FlightSettings) -> d
 
 
 def variance_factor(scene: Scene) -> float:
-    """Return the factor on covariances: more than 1 where only lever arms determine the scale of distances."""
+    """Return the factor on covariances: above 1 if only lever arms determine the scale of distances."""
     given = sum(place is not None for place in scene.still.values())
     measured = len(scene.places) or len(scene.heights) or scene.inertial or len(scene.tapes)
-    # Where only geometry determines distances the problem is not linear: errors up to 4.2 linearised standard errors
-    # were observed (docs/accuracy.md), so that these are multiplied by three.
+    # If only geometry determines distances the problem is not linear: errors up to 4.2 linearised standard errors were
+    # observed (docs/theory.md), so these are multiplied by three.
     return 1.0 if given >= 2 or measured else 9.0
 
 
@@ -271,9 +273,10 @@ def _distance_std_m(top: Search) -> float:
 def _undetermined_text(
     free: Sequence[int], tags: Sequence[int], covariance_ns2: Floats, splits: Sequence[Split]
 ) -> str:
-    """Return a sentence on the delays of `free` tags, which are not determined, "" for none.
+    """Return a sentence on the undetermined delays of `free` tags, "" for none.
 
-    `covariance_ns2` is that of `tags`, held along undetermined `splits`: it describes sums of delays of two sides.
+    `covariance_ns2` is the covariance of `tags`, zero along undetermined `splits`: it describes sums of delays of two
+    sides.
     """
     if not free:
         return ""
@@ -319,7 +322,7 @@ def verdict_on(covariance: Floats, with_truth: Floats, tags: Sequence[int]) -> V
     if not tags:
         return judge(np.eye(1) * 1e6, [InformationColumn("delay", "")])
     # `LOOSEST` of 0.2 ns is 3 cm of range; from simulations (docs/accuracy.md): wider intervals did not hold. If a fit
-    # with known distances is less certain, a direction may be three times less certain than that.
+    # with known distances is less certain than this, the limit is three times its standard error.
     guess = np.maximum(0.2, 3.0 / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
     information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True)
     information += np.eye(len(covariance)) / BOARD_DELAY_STD_NS**2
@@ -349,7 +352,7 @@ def _of_tapes(top: Search) -> Iterator[str]:
         mine = np.flatnonzero(tapes.number == number)
         moved = rows.geometry.derivatives(x, mine).mean(axis=0)
         leverage = float(moved @ (top.optimum.covariance @ moved)) / one.sigma_m**2
-        # A tape that no range checks has all the leverage, and is not tested.
+        # A tape without ranges that test it has a leverage of 1, and is not tested.
         if leverage >= 0.999:
             continue
         free = 1 - leverage

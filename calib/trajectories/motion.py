@@ -1,8 +1,8 @@
 """Positions and attitudes of bodies as unknowns of a fit.
 
 Positions are uniform cubic B-splines. Errors of attitudes are rotations about the world's axes, linear between points a
-second apart. `Distances` gives distances between antennas and their derivatives, `known_rows` the rows of what is known
-beside ranges.
+second apart. `Distances` computes distances between antennas and their derivatives, `known_rows` the rows of all other
+measurements.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TURN_S = 1.0
 (`python -m benchmarks.constants`)."""
 
 MOTION = {"path": 3, "turn": 3, "stand": 3, "bias": 3, "level": 1}
-"""Kinds of unknowns of motion, and how many axes each has."""
+"""Kinds of unknowns of motion, and the number of axes of each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class Grid:
 
     def velocities(self, time_s: Floats) -> tuple[Ints, Floats]:
         """Return the control points (n, 4) and weights (n, 4) of the derivative of cubic B-splines."""
-        # The derivative has differences of control points, over the step, as points of quadratic B-splines.
+        # The derivative is a quadratic B-spline, whose points are differences of control points divided by the step.
         first, share = Grid(self.start_s + self.step_s / 2, self.step_s, self.count - 1).splines(time_s, 2)
         return first[:, :1] + np.arange(4), -np.diff(np.pad(share, ((0, 0), (1, 1)))) / self.step_s
 
@@ -76,7 +76,7 @@ class Motion:
     @classmethod
     def of(cls, scene: Scene, point_s: float = POINT_S) -> Motion:
         """Return the motion of a scene with control points `point_s` seconds apart."""
-        # At multiples of the interval, so that parts of a scene have the control points of the whole.
+        # At multiples of the interval, so that parts of a scene have the same control points as the whole.
         begin = float(np.floor(scene.time_s[0] / TURN_S) * TURN_S)
         length = float(scene.time_s[-1]) - begin
         return cls(
@@ -116,7 +116,7 @@ class Motion:
                 self.turns.count,
                 [_differences(self.turns.count, k, one) for k, one in enumerate((std, wander))],
             ),
-            # any hall
+            # larger than any hall
             "stand": (1, [Prior.of_deviation(100.0)]),
             # 40 mg, the order of magnitude in data sheets of MEMS sensors
             "bias": (1, [Prior.of_deviation(0.4)]),
@@ -159,12 +159,12 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class RangeEnd:
-    """One end of each distance (n,): where its antenna is as a function of the unknowns.
+    """One end of each distance (n,): the position of its antenna as a function of the unknowns.
 
-    `mover` is the number of the moving body, -1 for another one. Of a moving body, `place` (n, 4, 3) are the control
+    `mover` is the number of the moving body, -1 for other bodies. For a moving body, `place` (n, 4, 3) are the control
     points of its path with weights `place_share` (n, 4), and `arm_m` (n, 3) is the lever arm by the given attitude,
-    whose errors are `turn` (n, 2, 3) with weights `turn_share` (n, 2). Of a standing body, `base_m` (n, 3) is the
-    antenna's position, or its offset from the sought position, the one entry of `place`. -1 is no unknown.
+    whose errors are `turn` (n, 2, 3) with weights `turn_share` (n, 2). For a standing body, `base_m` (n, 3) is the
+    antenna's position, or its offset from the sought position, which is the only entry of `place`. -1 means no unknown.
     """
 
     mover: Ints
@@ -211,7 +211,7 @@ class RangeEnd:
 
 @dataclass(frozen=True)
 class Distances:
-    """Distances between antennas of bodies that move or stand, as functions of all unknowns (a `Geometry`)."""
+    """Distances between antennas of moving or standing bodies, as functions of all unknowns (a `Geometry`)."""
 
     sides: tuple[RangeEnd, RangeEnd]
     columns: Ints
@@ -222,8 +222,8 @@ class Distances:
         first, second = (RangeEnd.of(motion, layout, some, time_s) for some in ids)
         blocks = [part.reshape(len(time_s), -1) for side in (first, second) for part in (side.place, side.turn)]
         columns = np.concatenate(blocks, axis=1)
-        # Where an end does not depend on an unknown, its entry is zero in a column that the other end uses.
-        # Between anchors at given positions no entry is used, and any column is valid.
+        # If an end does not depend on an unknown, its entry is zero in a column that the other end uses. Between
+        # anchors at given positions no entry is used, and any column is valid.
         return cls((first, second), np.maximum(np.where(columns < 0, columns.max(axis=1)[:, None], columns), 0))
 
     def antennas(self, x: Floats, rows: Ints | slice = slice(None)) -> tuple[Floats, Floats, Floats, Floats]:
@@ -245,7 +245,7 @@ class Distances:
         parts = []
         for side, arm, sign in zip(self.sides, arms, (-1.0, 1.0), strict=True):
             pull = sign * towards
-            # By a turn t the arm a moves by t x a, and u (t x a) = t (a x u).
+            # A rotation t moves the arm a by t x a, and u (t x a) = t (a x u).
             parts.append(side.place_share[rows][:, :, None] * pull[:, None, :])
             parts.append(side.turn_share[rows][:, :, None] * np.cross(arm, pull)[:, None, :])
         return distance, np.concatenate([part.reshape(len(away), -1) for part in parts], axis=1)
@@ -266,7 +266,7 @@ class TapeRows:
     std_m: Floats
 
     def left(self, x: Floats) -> Floats:
-        """Return taped less estimated distances (n,)."""
+        """Return taped minus estimated distances (n,)."""
         return self.measured_m - self.geometry.distances(x)[0]
 
     def terms(self, x: Floats) -> Iterator[Terms]:
@@ -279,14 +279,14 @@ LEAST_JERK, MOST_JERK = 0.2, 2000.0
 """Bounds of jerk, m/s^3."""
 
 FAR_M = 30.0
-"""Prior standard deviation of a control point around its initial guess: it holds points without any range.
-Half or twice of it moves delays by 0.05 standard errors (`python -m benchmarks.constants`)."""
+"""Prior standard deviation of a control point around its initial guess: it determines points without any range. Half or
+twice of it moves delays by 0.05 standard errors (`python -m benchmarks.constants`)."""
 
 
 CALM_M_S2, CALM_SENSED_M_S2 = 5.0, 50.0
-"""Prior standard deviation of accelerations, which holds a path where ranges are missing; the second where an
-accelerometer measures them. Half or twice of the first moves delays by 0.03 standard errors
-(`python -m benchmarks.constants`)."""
+"""Prior standard deviation of accelerations, which determines a path where ranges are missing; the second is for bodies
+with an accelerometer. Half or twice of the first moves delays by 0.03 standard errors (`python -m
+benchmarks.constants`)."""
 
 SLOW_M_S = 3.0
 """Prior standard deviation of speeds in a room. Half or twice of it moves delays by 0.14 standard errors
@@ -348,7 +348,8 @@ def _forces(motion: Motion, layout: Layout, body: str) -> NormalRows:
     weights = [share[:, :, None] * np.full(3, 1 / SAMPLE_S) for share in (end, -begin)]
     entries = [*weights, np.swapaxes(sensed.turn, 1, 2)]
     if body in turning:
-        # A turn t of the attitude adds t x (R f) to the force: along an axis by t about the next and the last one.
+        # A rotation t of the attitude adds t x (R f) to the force: its component on an axis depends on t about the
+        # other two.
         middle, part = motion.turns.splines(sensed.time_s, 1)
         turn = motion.numbers(layout, "turn")[middle, turning.index(body)]
         following, last = [1, 2, 0], [2, 0, 1]

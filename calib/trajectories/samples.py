@@ -24,10 +24,10 @@ from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.recording.schema import Arrangement, KnownDistance
 
 POINT_S = 0.4
-"""Time between control points of a path: a multirotor does not change its acceleration faster.
+"""Time between control points of a path: the acceleration of a multirotor does not change faster.
 
-A taped distance is one measurement. While it holds it counts once in this time, with a standard error that grows by the
-square root of the number of instants.
+A taped distance is one measurement. While it is valid it has one row per this interval, with a standard error
+multiplied by the square root of the number of rows.
 """
 
 SAMPLE_S = POINT_S / 4
@@ -36,20 +36,20 @@ forces are averaged: vibrations cancel, and the acceleration of a spline hardly 
 
 
 TRUSTED = 3.0
-"""Factor on the spread of a sensor's residuals: its errors last for some windows."""
+"""Factor on the spread of a sensor's residuals, because its errors last for some windows."""
 
 
 @dataclass(frozen=True, slots=True)
 class Samples(ColumnTable):
-    """Columns of one length (k,); `time_s`, in the place of `time_ns`, are the seconds at which they hold.
+    """Columns of one length (k,); `time_s`, instead of `time_ns`, are the seconds at which they are valid.
 
-    NaN stands for always.
+    NaN means always.
     """
 
     time_s: Floats
 
     def between(self, begin_s: float, end_s: float) -> Self:
-        """Return the samples inside a span of time, and those that always hold."""
+        """Return the samples inside a span of time, and those that are always valid."""
         return self[np.isnan(self.time_s) | ((self.time_s >= begin_s) & (self.time_s <= end_s))]
 
 
@@ -74,9 +74,9 @@ class Heights(Samples):
         """Return the readings with standard errors from their residuals (k,)."""
         if not len(self):
             return self
-        # How level floors are, and nearly half the height of a room.
+        # The flatness of floors, and nearly half the height of a room.
         std_m = float(np.clip(TRUSTED * robust_spread(residual_m, 0.0), 0.02, 1.0))
-        # Readings beyond two spreads count less (Huber 1964): the sensor looks at what stands below it.
+        # Readings beyond two spreads have less weight (Huber 1964): objects may be below the sensor.
         weight = np.minimum(1.0, 2.0 * std_m / TRUSTED / np.maximum(np.abs(residual_m), 1e-9))
         return replace(self, std_m=std_m / np.sqrt(weight))
 
@@ -91,7 +91,7 @@ def heights_of(table: Mapping[str, NDArray[Any]], moving: Sequence[str], began_n
     window = np.column_stack([number, np.floor(time_s / SAMPLE_S)])[rows]
     group = np.unique(window, axis=0, return_inverse=True)[1].ravel()
     time, body, height = (medians(column[rows], group) for column in (time_s, number, height_m))
-    # A decimetre beside the sensor's constant offset, before residuals are known.
+    # A decimetre in addition to the sensor's constant offset, before residuals are known.
     return Heights(time, body.astype(np.int64), height, np.full(len(time), 0.1))
 
 
@@ -99,8 +99,8 @@ def heights_of(table: Mapping[str, NDArray[Any]], moving: Sequence[str], began_n
 class Tapes(Samples):
     """Distances by tape at instants (k,): tags, metres, standard errors, and the number of the statement.
 
-    All instants of one statement together carry its information. `stated` are the statements that are used,
-    `left_out` says of each other one why it is not.
+    All instants of one statement together carry its information. `stated` are the statements that are used, `left_out`
+    the reasons why the others are not.
     """
 
     first: Ints
@@ -120,10 +120,10 @@ def tapes_of(
     began_ns: int,
     last_s: float,
 ) -> Tapes:
-    """Return when distances hold: always between bodies that stand, else while their arrangement lasts.
+    """Return the times at which distances are valid: always between standing bodies, else during their arrangement.
 
     `bodies` gives the body of each tag, `still` names the bodies that stand. An arrangement is one of the recording's,
-    or a span of seconds since the first range ("2..8"); a distance without one holds in all arrangements. Raises
+    or a span of seconds since the first range ("2..8"); a distance without one is valid in all arrangements. Raises
     `BadInputError` for an unknown tag or arrangement, and for a distance that is not a positive number.
     """
     spans = {one.name: ((one.start_ns - began_ns) * 1e-9, (one.end_ns - began_ns) * 1e-9) for one in arrangements}
@@ -163,7 +163,7 @@ def _unusable(one: KnownDistance, bodies: Mapping[int, str]) -> str:
 
 
 def _instants(one: KnownDistance, spans: Mapping[str, tuple[float, float]], last_s: float) -> list[float]:
-    """Return the seconds at which a distance between moving bodies counts."""
+    """Return the seconds at which a distance between moving bodies has rows."""
     seconds = re.match(r"^\s*(\d+(?:\.\d*)?)\s*\.\.\s*(\d+(?:\.\d*)?)\s*$", one.arrangement)
     if not one.arrangement:
         chosen = list(spans.values())
@@ -212,7 +212,7 @@ class Attitude:
 
     @cached_property
     def _slerp(self) -> Slerp:
-        # A second instant makes a single attitude last.
+        # A second instant extends a single attitude.
         instants, rows = np.unique(np.append(self.time_s, self.time_s[-1] + 1.0), return_index=True)
         return Slerp(instants, Rotation.from_quat(self.quaternion[np.minimum(rows, len(self.time_s) - 1)]))
 
@@ -266,7 +266,7 @@ def windows(readings: Readings, attitude: Attitude, last_s: float) -> Inertial:
     mean_turn = np.add.reduceat(turn, starts) / count[:, None, None]
     # Larger mean accelerations are impacts, not flight.
     flown = np.linalg.norm(mean_force - (0, 0, GRAVITY_M_S2), axis=1) < 4.0
-    # The mean of a window that lacks a third of its readings is not that of its middle.
+    # The mean of a window that lacks a third of its readings is not the value at its middle.
     kept = flown & (count >= 0.7 * readings.per_window)
     return Inertial((slot[kept] + 0.5) * SAMPLE_S, mean_force[kept], mean_turn[kept])
 
@@ -314,14 +314,14 @@ def _carried_on(readings: Readings, first: int, attitude: Floats, bias: Floats) 
     found, up = np.empty((len(steps), 3, 3)), np.array([0.0, 0.0, 1.0])
     for k, share in enumerate(shares.tolist()):
         found[k] = attitude
-        # A turn by pull x vertical, small enough to be linear: the last row of the matrix is the world's vertical.
+        # A rotation by pull x vertical, small enough to be linear: the last row of the matrix is the world's vertical.
         levelling = np.outer(up, pulls[k]) - np.outer(attitude @ pulls[k], attitude[2])
         attitude = (attitude + share * levelling) @ turns[k]
     return np.asarray(Rotation.from_matrix(found).as_quat())
 
 
 def _gyro_bias(readings: Readings, known: Attitude, until_s: float, step_s: float = 0.5) -> Floats:
-    """Return the bias of the gyroscope (3,), rad/s: the median of its readings less the known turn rates, which are
+    """Return the bias of the gyroscope (3,), rad/s: the median of its readings minus the known turn rates, which are
     means over `step_s`."""
     last = min(until_s, float(known.time_s[-1]), float(readings.time_s[-1]))
     edges = np.arange(max(float(known.time_s[0]), float(readings.time_s[0])), last, step_s)

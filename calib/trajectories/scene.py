@@ -37,7 +37,7 @@ class Scene:
 
     `moving` names the moving bodies. `still` gives the position of each standing body, None if it is estimated. `arms`
     gives the body and the lever arm of each tag: of moving bodies in the body's axes, of standing ones in the world's.
-    `attitudes` are those of moving bodies; without an attitude the tags of a body are at its centre. `tapes` are
+    `attitudes` are the attitudes of moving bodies; without one the tags of a body are at its centre. `tapes` are
     distances by tape, `heights` readings of height sensors.
     """
 
@@ -101,12 +101,12 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
         exchanges = single_reports(source.exchanges).exchanges
         poses, tags = source.poses, list(source.tags)
         planted, delays = planted_of(source, name), antenna_delays_of(source, name)
-        # A source need not have any of these.
+        # A source may lack any of these.
         imu, height = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
         stated, arrangements = (tuple(getattr(source, one, ())) for one in ("known_distances", "arrangements"))
     if not tags:
         raise UnanswerableError(f"{name}: contains no bodies of tags; add them with 'uwblink poses --tags'")
-    # The truth is not known. In its place stands the time to which a range belongs.
+    # True distances are unknown. The times of ranges are in their place.
     ranges = Ranges.from_exchanges(
         exchanges,
         np.asarray(range_ns(exchanges) * 1e-9, dtype=np.float64),

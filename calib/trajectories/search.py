@@ -1,7 +1,7 @@
 """Maximum likelihood of delays, curve, errors and trajectories together, from an initial guess of trajectories.
 
 Ranges first have Cauchy's likelihood, which converges from far away, then that of `calib.range_errors`. The parameters
-of errors and the motion are fitted in turn. The variance of jerk and the standard deviations of accelerometers and
+of errors and the motion are fitted alternately. The variance of jerk and the standard deviations of accelerometers and
 height sensors are estimated as well.
 """
 
@@ -39,18 +39,18 @@ FIRST_SCALE_M = 0.15
 """First scale of Cauchy's loss, while delays and curve are unknown."""
 
 LITTLE_LEVERAGE, MAX_LEVERAGE = 0.5, 0.9
-"""Ranges with a leverage up to the first inform about errors. Leverages are limited to the second, because residuals
-are divided by the root of 1 - leverage."""
+"""Errors are estimated from ranges with a leverage up to the first value. Leverages are limited to the second, because
+residuals are divided by the root of 1 - leverage."""
 
 MIN_RANGES_PER_PAIR = 15
-"""With fewer ranges per pair, less those that the unknowns use up, all pairs share one error model."""
+"""With fewer ranges per pair, minus the number of unknowns per pair, all pairs share one error model."""
 
 
 def _cauchy(scale_m: float) -> Robust:
     """Return Cauchy's likelihood of residuals: twice its loss.
 
-    A fifth of the weights of reweighted least squares replaces a negative curvature, so that it converges from far
-    away.
+    A fifth of the weights of reweighted least squares replaces a negative curvature, so that the search converges from
+    far away.
     """
     return Robust(weights=LOSSES["cauchy"].weights, scale_m=scale_m, least=0.2, dispersion=0.5)
 
@@ -87,7 +87,7 @@ def fit_motion(
 
 
 def search(scene: Scene, model: RangeModel, error_m: Floats, start: State, done: Callable[[float], None]) -> Search:
-    """Return the likeliest unknowns; `error_m` (n,) are the ranges of the scene, less a known curve."""
+    """Return the likeliest unknowns; `error_m` (n,) are the ranges of the scene minus a known curve."""
     state = Search(scene, model, error_m, start, done)
     state.fit_robustly()
     # Control points are not refined below 0.11 s.
@@ -101,7 +101,7 @@ def search(scene: Scene, model: RangeModel, error_m: Floats, start: State, done:
 class Search:
     """The state of a search; each method changes one part of it.
 
-    At its end `optimum` has all unknowns of `motion` and ranges (`rows`), beside what else is `known` of the motion.
+    At its end `optimum` has all unknowns of `motion` and ranges (`rows`); `known` are the other rows on the motion.
     """
 
     optimum: Optimum
@@ -109,7 +109,7 @@ class Search:
     def __init__(
         self, scene: Scene, model: RangeModel, error_m: Floats, start: State, done: Callable[[float], None]
     ) -> None:
-        """Begin at a start of the motion; `error_m` (n,) are ranges, `done` is told the share that is done."""
+        """Begin at a start of the motion; `error_m` (n,) are ranges, `done` is called with the completed share."""
         self.model, self.error_m, self.done = model, error_m, done
         self.motion, self.origin, self.steps = Motion.of(scene), start, 0
         self.leverage: Floats = np.zeros(len(error_m))
@@ -125,7 +125,7 @@ class Search:
         *,
         jerk_m_s3: float = JERK_M_S3,
     ) -> None:
-        """Build layout, priors and rows with the present values; unknowns and parts are those of the errors."""
+        """Build layout, priors and rows with the present values; `unknowns` and `parts` are for the errors."""
         model, ranges, motion = self.model, self.model.ranges, self.motion
         self.layout = Layout((*model.unknowns, *motion.unknowns(self.origin, jerk_m_s3), *unknowns))
         self.geometry = Distances.of(motion, self.layout, (ranges.initiator, ranges.target), motion.scene.time_s)
@@ -168,9 +168,9 @@ class Search:
         self.update_sensor_errors()
 
     def _restrict(self) -> None:
-        """Make the likelihood of noise a restricted one: residuals have variances of the mean leverage of all ranges.
+        """Use restricted likelihood for noise: the variances of residuals follow from the mean leverage of all ranges.
 
-        The leverage of a single range is known to some 14 % (`diagonal_of`).
+        The leverage of a single range has an error of some 14 % (`diagonal_of`).
         """
         noise = self.rows.values(self.x, ("noise",))["noise"][self.rows.order]
         self.rows = replace(self.rows, unsure_m2=np.mean(self.leverage) * np.exp(2 * noise))
@@ -181,7 +181,7 @@ class Search:
 
     @property
     def free_ranges(self) -> float:
-        """Return the number of ranges less those that the unknowns use up."""
+        """Return the number of ranges minus the effective number of unknowns."""
         return float(np.sum(1 - self.leverage))
 
     def informative_rows(self) -> Ints:
@@ -201,28 +201,28 @@ class Search:
         self.known = known_rows(self.motion, self.layout)
 
     def refine(self) -> None:
-        """Double the number of control points, and allow quicker motion."""
+        """Double the number of control points, and allow faster motion."""
         finer, self.values = self.motion.refined(self.values)
         self.origin = self.motion.refined(self.origin)[1]
         self.motion = finer
         self.weights.pop(("path", 0))
         errors = self.rows.errors
-        # Motion that wider control points do not follow is quick; its jerk is estimated from here.
+        # Motion that fewer control points do not represent is fast; this is the start for its jerk.
         self.build(errors, jerk_m_s3=100.0)
         self.optimize(errors)
 
     def fit_likelihood(self) -> None:
         """Maximise the likelihood of direct, reflected and outlying ranges.
 
-        Motion and errors are fitted in turn: the joint likelihood is unbounded where a path goes exactly through some
-        ranges and their noise is zero.
+        Motion and errors are fitted alternately: the joint likelihood is unbounded if a path fits some ranges exactly
+        and their noise is zero.
         """
         mixture, unknowns, parts = self.model.error_model(self.residuals())
         few = self.free_ranges < MIN_RANGES_PER_PAIR * len(self.model.pairs.ends)
         if few:
             unknowns = tuple(u if len(u.names) == 1 else _as_known(u, u.start) for u in unknowns)
         errors, delays, settled = replace(mixture, expected=True), self.values["delay"], False
-        # At most eight turns; they end when no delay moves by more than a tenth of its standard error.
+        # At most eight rounds; they end if no delay moves by more than a tenth of its standard error.
         for turn in range(8):
             # The parameters of errors, from the residuals.
             layout, rows = self.model.build(self.residuals(), mixture, unknowns, parts, only=())
@@ -231,7 +231,7 @@ class Search:
             found = maximize([rows.sample(self.informative_rows())], priors, layout.start(self.values), tolerance=0.1)
             self.values |= found.by_kind()
             self.weights |= priors.by_key()
-            # The motion, with those.
+            # The motion, with these parameters.
             self.build(errors, tuple(_as_known(unknown, self.values[unknown.kind]) for unknown in unknowns), parts)
             found = self.optimize(errors, evidence_steps=0 if turn > 1 else 12, tolerance=0.03, steps=20)
             if turn == 0:
@@ -252,11 +252,12 @@ class Search:
         self.optimum = replace(found, success=settled)
 
     def missed_motion_m(self) -> float:
-        """Return the size of the motion along an axis that paths miss, in metres; 0 below 4 standard errors or 1 cm.
+        """Return the size of the motion along an axis that paths do not represent, in metres; 0 below 4 standard errors
+        or 1 cm.
 
-        A missed motion enters all ranges of the body along their directions, so residuals of ranges that follow each
-        other correlate as their directions do. Only ranges of different pairs are multiplied, which excludes lasting
-        errors of a pair (reflections).
+        A missed motion changes all ranges of the body along their directions, so residuals of consecutive ranges
+        correlate like their directions. Only ranges of different pairs are multiplied, which excludes lasting errors of
+        a pair (reflections).
         """
         time, pair = self.motion.scene.time_s, self.model.pairs.number
         _, by, known = self.rows.errors.slopes(self.rows.values(self.x))
@@ -294,7 +295,8 @@ def _as_known(unknown: Unknown, values: Floats) -> Unknown:
 
 
 def leverages(rows: RangeRows, found: Optimum) -> Floats:
-    """Return the leverage of each range (n,), at most `MAX_LEVERAGE`: the share of it that the unknowns use up.
+    """Return the leverage of each range (n,), at most `MAX_LEVERAGE`: the share of its information that determines
+    unknowns.
 
     This is the diagonal of W^1/2 A C A' W^1/2, with the information W of residuals, their derivatives A and the
     covariance C.

@@ -1,6 +1,6 @@
-"""Initial guess of trajectories: windows that follow each other, from known positions or from the best first window.
+"""Initial guess of trajectories: consecutive windows, from known positions or from the best first window.
 
-Delays and curve are unknown, so ranges have a wide Cauchy likelihood, which narrows.
+Delays and curve are unknown, so ranges have a wide Cauchy likelihood, which becomes narrower.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from calib.trajectories.search import JERK_M_S3, MotionFit, State, fit_motion
 from uwblink.arrays import Floats
 
 RANGES_A_BODY = 24
-"""A window has so many ranges per moving body, within 2 to 20 s; the next begins half a window later."""
+"""Number of ranges per moving body in a window, within 2 to 20 s; the next begins half a window later."""
 
 
 SCALES_M = (3.0, 1.0, 0.3)
 """Scales of Cauchy's likelihood while delays and curve are unknown: wide ones make the problem nearly convex."""
 
 WINDOW_JERK_M_S3 = 3.0
-"""Standard deviation of jerk in a window; small, because ranges count less under a wide likelihood."""
+"""Standard deviation of jerk in a window; small, because ranges have less weight with a wide likelihood."""
 
 START_COUNT, SAMPLED_RANGES = 24, 400
 """Random starts of the first window, and the number of its ranges that are used."""
@@ -123,7 +123,7 @@ def _extend(
         edge = float(found.time_s[::sign][-1])
         while sign * (last_s - edge) > 1e-6:
             window = scene.between(edge - step, edge + step)
-            # Sums of steps are not exact.
+            # Sums of steps have rounding errors.
             near = found.between(edge - step - 1e-9, edge + step + 1e-9)
             fresh: Floats = np.asarray(edge + sign * SAMPLE_S * np.arange(1, round(step / SAMPLE_S) + 1))
             fresh = fresh[sign * (fresh - last_s) <= SAMPLE_S]
@@ -153,7 +153,7 @@ def _carried_on(near: Trajectories, time_s: Floats, sign: int) -> Floats:
 def _fit_first_window(scene: Scene) -> tuple[Scene, Trajectories, Floats, str]:
     """Return the best of many starts of the first window: scene, positions, standing bodies and a second solution."""
     headless = scene.without_heading
-    # Where headings are unknown the first window lasts 8 s at least.
+    # With unknown headings the first window lasts at least 8 s.
     length = max(_window_s(scene), 8.0 if headless else 0.0)
     time = np.arange(float(scene.time_s[0]), float(scene.time_s[0]) + length + SAMPLE_S / 2, SAMPLE_S)
     window = scene.between(float(time[0]), float(time[-1])).thinned(SAMPLED_RANGES)
@@ -163,7 +163,7 @@ def _fit_first_window(scene: Scene) -> tuple[Scene, Trajectories, Floats, str]:
 
     guesses = list(_guesses(window, time, headless))
     wide = [(tried(guess.state(window, stand), heading, SCALES_M[:1]), heading) for guess, stand, heading in guesses]
-    # Eight starts go on after the widest likelihood, which is nearly convex.
+    # Eight starts are kept after the widest likelihood, which is nearly convex.
     kept = sorted(wide, key=lambda one: -one[0].value)[:8]
     narrow = [(tried(one.state, heading, SCALES_M[1:]), heading) for one, heading in kept]
     best, heading = max(narrow, key=lambda one: one[0].value)
@@ -236,7 +236,7 @@ def resolve_headings(scene: Scene, state: State) -> tuple[Scene, State, str]:
     """Return the scene with the headings that fit the whole flight best, its motion, and a sentence on doubtful ones.
 
     A first window with few ranges leaves a heading uncertain by tens of degrees, and a local search does not recover.
-    Each unknown heading is therefore tried all around over the whole flight.
+    Therefore a full circle of headings is tried over the whole flight for each unknown one.
     """
     unknown = scene.without_heading
     if not unknown:

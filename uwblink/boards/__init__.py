@@ -1,6 +1,6 @@
 """Boards on serial ports: driver, plans, recorder, replay, and a picture of an impulse response.
 
-Replay is of the stored bytes of a recording: decoded again, or played back on pseudo-terminals.
+Replay uses the stored bytes of a recording: it decodes them again, or plays them back on pseudo-terminals.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Decoded:
 
 def decode_again(recording: Recording) -> Decoded:
     """Decode all bytes from boards; raises `RecordingError` if there are none."""
-    frames, ids = _heard(recording), board_ids(recording)
+    frames, ids = _bytes_from_boards(recording), board_ids(recording)
     decoders = {frame.board: Decoder(REPORTS) for frame in frames}
     boards = {name: ids.get(name, k) for k, name in enumerate(decoders)}
     parts, others = [exchanges_of([])], list[Heard]()
@@ -102,7 +102,7 @@ def decode_again(recording: Recording) -> Decoded:
             yield from (Heard(frames[-1].time_ns, boards[name], e) for e in decoder.finish())
 
     events = heard()
-    # In blocks, because messages as objects take ten times the memory of columns.
+    # In blocks, because messages as objects need ten times the memory of columns.
     while block := list(islice(events, 10_000)):
         parts.append(exchanges_of((one.time_ns, one.board, one.message) for one in block))
         others += [one for one in block if not isinstance(one.message, RangeReport)]
@@ -140,7 +140,7 @@ def play(
     `ready` is called with the new name of each board's port before the first byte. Raises `RecordingError` if the
     recording has no bytes.
     """
-    frames = _heard(recording)
+    frames = _bytes_from_boards(recording)
     ids = board_ids(recording)
     names = sorted({frame.board for frame in frames})
     terminals = {n: Terminal(link_dir / f"tag{ids.get(n, k)}" if link_dir else None) for k, n in enumerate(names)}
@@ -168,7 +168,7 @@ def summarize(recording: Recording, decoded: Decoded) -> dict[str, Any]:
     }
 
 
-def _heard(recording: Recording) -> list[FrameRow]:
+def _bytes_from_boards(recording: Recording) -> list[FrameRow]:
     """Return the bytes from boards; raises `RecordingError` when there are none."""
     frames = [frame for frame in recording.frames() if frame.direction == "in"]
     if not frames:

@@ -1,4 +1,4 @@
-"""A board at a serial port: the conversation with it, without any I/O, and what scripts and notebooks use.
+"""A board at a serial port: the conversation with it, without I/O, and a class for scripts and notebooks.
 
 ```python
 from uwblink.boards.board import Board
@@ -9,8 +9,9 @@ with Board.open("/dev/ttyACM0") as board:
 ```
 
 One command is outstanding at a time; it ends with its reply, with a line of text by which the firmware reports a
-failure, or by time. After a time-out the board may still answer, and a late reply must not pass for that of the next
-command: a fence (C00, answered by R00) is sent first, and what comes before R00 is late (firmware wire format, 1.8).
+failure, or with a time-out. After a time-out the board may still answer, and a late reply must not be taken for the
+reply of the next command. Therefore a fence (C00, answered by R00) is sent first, and replies before R00 are late
+(firmware wire format, 1.8).
 """
 
 from __future__ import annotations
@@ -46,25 +47,25 @@ from uwblink.wire.messages import (
 )
 
 FENCE: Final = SetIdle()
-"""A command after whose answer no late answers can come."""
+"""A command whose answer comes after all late answers."""
 
 ANSWER_S: Final = 0.15
-"""Longest wait for a reply: six failing tries take 50 ms, and the rest is USB and the host."""
+"""Longest wait for a reply: six failing tries take 50 ms, the rest is for USB and the host."""
 
 PATIENT_S: Final = 1.0
 """Longest wait for the answer to a fence, after which the board is considered dead."""
 
 QUIET_AFTER_CIR_S: Final = 0.030
-"""How long an initiator is left alone after the report of an exchange whose impulse response was asked for: it prints
-for 22 to 28 ms (firmware wire format, 1.4)."""
+"""Time without commands to an initiator after the report of an exchange with impulse response: it prints for 22 to 28
+ms (firmware wire format, 1.4)."""
 
 QUIET_TARGET_S: Final = 0.040
-"""The same for the target, which prints its own before its report, if it was asked to report."""
+"""The same for the target, which prints its response before its report, if reports of targets are on."""
 
 
 @dataclass(frozen=True, slots=True)
 class CommandOutcome:
-    """How a command ended: the reply, or an error that says why there is none."""
+    """The end of a command: the reply, or an error with the reason why there is none."""
 
     command: Message
     reply: Message | None
@@ -90,7 +91,7 @@ class Connection:
         self.name = name
         self.decoder = Decoder(REPORTS)
         self.doubtful = False
-        """Whether a late reply may still come, so that a fence must be sent before the next command."""
+        """Whether a late reply is possible, so that a fence must be sent before the next command."""
         self._answer_s = answer_s
         self._pending: _Pending | None = None
         self._quiet_until_s = 0.0
@@ -101,11 +102,11 @@ class Connection:
         return self._pending is not None
 
     def ready_s(self, now_s: float) -> float:
-        """Return how long to wait until the board may be asked again."""
+        """Return the time to wait until the board may get the next command."""
         return max(self._quiet_until_s - now_s, 0.0)
 
     def keep_quiet(self, until_s: float) -> None:
-        """Send no command before a time, because the board is printing an impulse response."""
+        """Send no command before a given time, because the board is printing an impulse response."""
         self._quiet_until_s = max(self._quiet_until_s, until_s)
 
     def deadline_s(self) -> float | None:
@@ -113,7 +114,7 @@ class Connection:
         return self._pending.until_s if self._pending else None
 
     def send(self, command: Message, now_s: float) -> bytes:
-        """Return the bytes to write, in one write; raises `RefusedError` for what the board must not get."""
+        """Return the bytes to write, in one write; raises `RefusedError` for commands that the board must not get."""
         if self._pending:
             raise RefusedError(f"{self.name}: {self._pending.command.KEY.decode()} is still waiting for its answer")
         data = checked(command)
@@ -122,9 +123,9 @@ class Connection:
         return data
 
     def receive(self, data: bytes, now_s: float) -> tuple[list[Event], CommandOutcome | None]:
-        """Take in bytes, or none; returns everything they hold, and the outcome of the command if it ended."""
+        """Add received bytes, or none; returns all their events, and the outcome of the command if it ended."""
         events, outcome = self.decoder.feed(data), None
-        # The pieces of an impulse response come a millisecond apart, and a target's report 3 ms after it.
+        # The pieces of an impulse response arrive a millisecond apart, and a target's report 3 ms after it.
         if data and (self.decoder.begun == Cir.KEY or any(isinstance(event, Cir) for event in events)):
             self.keep_quiet(now_s + 0.005)
         if self._pending:
@@ -151,7 +152,7 @@ class Connection:
             return None
         if isinstance(event, TextLine):
             pending.lines.append(event.text.strip())
-            # Only these two kinds of command can fail; the text of another one is left over from before.
+            # Only these two kinds of command can fail; text after another command belongs to an earlier one.
             failed = event.text.startswith(("COMMANDED TASK FAILED", "TWR FAIL"))
             if not failed or not isinstance(command, RangeCommand | Broadcast):
                 return None
@@ -175,7 +176,7 @@ class Connection:
 
 
 def checked(command: Message) -> bytes:
-    """Return the bytes of a command; raises `RefusedError` for values that boards do not check."""
+    """Return the bytes of a command; raises `RefusedError` for invalid values, which boards do not check."""
     kind = type(command).__name__
     if COMMANDS.get(command.KEY) is not type(command):
         raise RefusedError(f"{kind} is not a command")
@@ -256,7 +257,7 @@ class Board(Closing):
 
     @property
     def id(self) -> int:
-        """The board's id; the board is asked once."""
+        """The board's id, read once."""
         if self._id is None:
             self._id = self._ask(GetId(), IdReport).board
         return self._id
@@ -333,7 +334,7 @@ class Board(Closing):
         return echo
 
     def reports(self, timeout_s: float) -> Iterator[Event]:
-        """Yield messages and lines of text that are no replies, until none came for `timeout_s`."""
+        """Yield messages and lines of text other than replies, until none arrives for `timeout_s`."""
         while True:
             while self._reports:
                 yield self._reports.popleft()
@@ -363,7 +364,7 @@ class Board(Closing):
         self._reports.extend(e for e in events if e is not reply and not isinstance(e, Skipped))
 
     def _pass(self, seconds: float, *, until_report: bool = False) -> None:
-        """Wait, and keep reports that arrive; with 0 seconds, read what has arrived."""
+        """Wait, and keep reports that arrive; with 0 seconds, read the bytes that have arrived."""
         until_s = self._transport.now_s() + seconds
         while True:
             data = self._transport.read(max(until_s - self._transport.now_s(), 0.0))

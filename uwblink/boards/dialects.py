@@ -1,7 +1,7 @@
 """Boards of other firmware, which print ranges as lines of text: dialects, and their ranges as they arrive.
 
-A dialect is a function from lines to ranges. The project's own are the forms of logs that `uwblink import guess` knows
-(`uwblink.importers.devices`), read as logs are: by the same column map, templates and SQL.
+A dialect is a function from lines to ranges. The project's dialects are the forms of logs of `uwblink import guess`
+(`uwblink.importers.devices`); they are read like logs, with the same column map, templates and SQL.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from uwblink.wire.messages import RangeReport
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PrintedRange:
-    """A range in metres as a board printed it. Ids are numbers or words; no `from_id` stands for the board itself.
+    """A range in metres as printed by a board. Ids are numbers or words; without `from_id` it is the board itself.
 
-    `power_dbm` is the first-path power, or the received power where a board prints no other.
+    `power_dbm` is the first-path power, or the received power if a board prints only this.
     """
 
     to_id: int | str
@@ -51,7 +51,7 @@ class PrintedRange:
 class Dialect:
     """The text format of a firmware: `parse` returns the ranges in some lines, and ignores other lines.
 
-    `start` is sent to a board once its port is open, so that it begins to print; `baud_rate` is that of the port.
+    `start` is sent to a board once its port is open, so that it begins to print; `baud_rate` is the rate of the port.
     """
 
     name: str
@@ -62,9 +62,9 @@ class Dialect:
 
 
 def parser_of(known: ColumnMap) -> Callable[[Sequence[str]], list[PrintedRange]]:
-    """Return the parser of lines by a column map with a `line`: they mean what they mean in an imported log.
+    """Return the parser of lines by a column map with a `line`; lines have the same meaning as in an imported log.
 
-    It raises `ImportTableError` for a map that does not say which device a range is to.
+    It raises `ImportTableError` for a map without the second device of ranges.
     """
 
     @cache
@@ -75,7 +75,7 @@ def parser_of(known: ColumnMap) -> Callable[[Sequence[str]], list[PrintedRange]]
             raise table.missing("range_m")
         power = next((cells[name] for name in ("fpp2", "rxp2", "fpp1", "rxp1") if name in cells), "NULL")
         found = {name: cells[name] for name in ("from_id", "to_id", "range_m")}
-        # Boards print 0 for a device that is not there.
+        # Boards print 0 for an absent device.
         kept = f"WHERE {cells['range_m']} > 0 AND {cells['to_id']} <> '' AND NOT {cells['blank']}"
         return table, found | {"power_dbm": f"coalesce({power}, 'nan'::DOUBLE)"}, kept
 
@@ -94,7 +94,7 @@ def parser_of(known: ColumnMap) -> Callable[[Sequence[str]], list[PrintedRange]]
     return parse
 
 
-# The shell of the DWM1001 opens on two carriage returns; `lec` prints distances as comma-separated lines.
+# Two carriage returns open the shell of the DWM1001; `lec` prints distances as comma-separated lines.
 _START: Final = {"dwm1001-lec": b"\r\rlec\r", "dwm1001-les": b"\r\rles\r"}
 
 DIALECTS: Final[Registry[Dialect]] = Registry(
@@ -135,13 +135,15 @@ def dialect_of(name: str) -> Dialect:
 
 @dataclass(slots=True, kw_only=True)
 class Printed(Progress):
-    """Counts of what boards printed, and the numbers of devices by what boards call them."""
+    """Counts of printed ranges, and the numbers of devices by their printed names."""
 
     lines: int = 0
     numbers: dict[int | str, int] = field(default_factory=dict)
 
     def number(self, name: int | str) -> int:
-        """Return the number of a device; a word gets the first one that is free. Raises `BoardError` for a clash."""
+        """Return the number of a device; a word gets the first free number. Raises `BoardError` if two devices have one
+        number.
+        """
         if name not in self.numbers:
             taken = set(self.numbers.values())
             free = name if isinstance(name, int) else next(k for k in range(1, LARGEST_ID + 1) if k not in taken)
@@ -153,7 +155,7 @@ class Printed(Progress):
         return self.numbers[name]
 
     def on_turn(self, turn: Turn) -> None:
-        """Count a range; of exchanges that failed nothing is printed, so there is no share of them."""
+        """Count a range; boards print nothing for failed exchanges, so their share is unknown."""
         Progress.on_turn(self, turn)
         self.pairs[turn.pair].tried = 0
 
@@ -172,11 +174,11 @@ def printed_ranges(
     using: Ports | None = None,
     seen: Printed | None = None,
 ) -> Iterator[list[Turn]]:
-    """Yield ranges that boards print, as turns with reports without stamps; None if nothing arrives for a while.
+    """Yield printed ranges as turns, with reports without stamps; None if nothing arrives for a while.
 
-    Their time is the host's. `ids` are those of the boards at `ports`, for lines without an initiator; 1, 2 ... by
-    default. `seen` counts. Raises the errors of opening ports, `BoardError` where a board prints lines and no range in
-    them, and `PlanError` for ids that do not fit the ports.
+    Their time is the host's. `ids` are the ids of the boards at `ports`, for lines without an initiator; 1, 2 ... by
+    default. `seen` counts the ranges. Raises the errors of opening ports, `BoardError` if a board prints lines without
+    ranges, and `PlanError` for ids that do not fit the ports.
     """
     names, using, seen = list(ports), using or SerialPorts(dialect.baud_rate), seen or Printed()
     own = list(ids) or list(range(1, len(names) + 1))
@@ -219,7 +221,7 @@ _REPORT: Final = RangeReport(
     neighbour=0, range_m=math.nan, fpp1_dbm=math.nan, fpp2_dbm=math.nan, skew1_ppm=math.nan, skew2_ppm=math.nan,
     **dict.fromkeys(STAMPS, 0),
 )  # fmt: skip
-"""A report with the default values that boards which print ranges do not send."""
+"""A report with default values for fields that boards with printed ranges do not send."""
 
 
 class _Lines:
@@ -229,13 +231,13 @@ class _Lines:
         self.name, self._rest, self._others, self._good = name, b"", 0, False
 
     def feed(self, data: bytes) -> list[str]:
-        """Take bytes; return the lines that ended in them."""
+        """Add bytes; return the lines that are complete."""
         *lines, self._rest = re.split(rb"[\r\n]+", self._rest + data)
         self._rest = self._rest[-4096:]  # of a line without an end; a list of 64 ranges takes half of that
         return [line.decode("latin-1") for line in lines if line.strip()]
 
     def note(self, lines: Sequence[str], found: Sequence[PrintedRange]) -> None:
-        """Note lines and their ranges; raises `BoardError` where the board prints another form."""
+        """Note lines and their ranges; raises `BoardError` if the board prints another form."""
         self._good, self._others = self._good or bool(found), self._others + len(lines)
         # Banners and menus are shorter (a judgement).
         if not self._good and self._others > 50:
@@ -257,8 +259,8 @@ def record_printed(
 ) -> Printed:
     """Record ranges that boards print until `stop` returns true or the time is over; returns the counts.
 
-    `how` are other parameters of `printed_ranges`, which raises; nothing is left where no range was printed. `watch`
-    and `listeners` are those of `uwblink.record`, and `KeyboardInterrupt` ends a recording like `stop`.
+    `how` are other parameters of `printed_ranges`, whose errors are raised; no file remains if no range was printed.
+    `watch` and `listeners` are as in `uwblink.record`, and `KeyboardInterrupt` ends a recording like `stop`.
     """
     path, seen, others = Path(output), Printed(), as_listeners(listeners)
     check_output(path, force=force, recording=True)

@@ -117,19 +117,19 @@ class Listener:
     """
 
     def on_start(self, pairs: Sequence[Pair]) -> None:
-        """Take the pairs that will range; an exception here ends the recording before anything is written."""
+        """Called with the pairs that will range; an exception here ends the recording before anything is written."""
 
     def on_bytes(self, time_ns: int, port: str, direction: str, data: bytes) -> None:
-        """Take bytes that came "in" from a port or went "out" to it."""
+        """Called with bytes that came "in" from a port or went "out" to it."""
 
     def on_message(self, heard: Heard) -> None:
-        """Take a message or a line of text of a board."""
+        """Called with a message or a line of text of a board."""
 
     def on_turn(self, turn: Turn) -> None:
-        """Take the result of a turn of the plan."""
+        """Called with the result of a turn of the plan."""
 
     def on_fault(self, fault: Fault) -> None:
-        """Take a fault."""
+        """Called with a fault."""
 
     def check(self) -> None:
         """Raise an exception to end the recording; called often."""
@@ -142,7 +142,7 @@ class CallbackListener(Listener):
     """Calls a function with every message of boards."""
 
     def __init__(self, callback: Callable[[Heard], object]) -> None:
-        """Call `callback` with each `Heard`; raises `TypeError` for what is no function."""
+        """Call `callback` with each `Heard`; raises `TypeError` for other objects than functions."""
         if not callable(callback):
             raise TypeError(f"listeners: found {callback!r}, expected a Listener or a function of one Heard")
         self._callback = callback
@@ -161,7 +161,7 @@ def as_listeners(listeners: Iterable[Listener | Callable[[Heard], object]]) -> l
 class PairState:
     """Counts of a pair, and the last reports of its exchanges, each with its host time (ns) and initiator.
 
-    `recent` has when its turns ended, and whether with a report.
+    `recent` has the end times of its turns, and whether there was a report.
     """
 
     tried: int = 0
@@ -174,8 +174,8 @@ class PairState:
 class Progress(Listener):
     """Counts of a recording. Times are in seconds since `start_ns` (host time).
 
-    `absent` has the host time at which each board was unplugged that has not come back. `waiting` pieces of bytes are
-    not in the file yet, whose last commit ended `behind_s` seconds ago.
+    `absent` has the host time at which each absent board was unplugged. `waiting` is the number of pieces of bytes that
+    are not in the file yet; its last commit ended `behind_s` seconds ago.
     """
 
     start_ns: int = 0
@@ -191,12 +191,12 @@ class Progress(Listener):
 
     @property
     def exchanges(self) -> int:
-        """Exchanges that succeeded."""
+        """Number of successful exchanges."""
         return sum(p.good for p in self.pairs.values())
 
     @property
     def tried(self) -> int:
-        """Exchanges that were begun and ended."""
+        """Number of exchanges that have ended, failed ones included."""
         return sum(p.tried for p in self.pairs.values())
 
     @property
@@ -210,7 +210,9 @@ class Progress(Listener):
         since_ns, over_s = now_ns - 2e9, min(2.0, max(self.time_s, 0.1))
         rows = []
         for pair, state in [*self.pairs.items()]:
-            reports = [*state.reports]  # copied at once: a page asks in a thread of its own, while the recorder goes on
+            reports = [
+                *state.reports
+            ]  # copied in one step: a page reads in its own thread while the recorder continues
             rate_hz = sum(time_ns > since_ns for time_ns, *_ in reports) / over_s
             ended = [good for time_ns, good in [*state.recent] if time_ns > now_ns - 10e9]
             success = f"{100 * sum(ended) / len(ended):.0f} %" if ended and state.tried else ""
@@ -257,14 +259,14 @@ class Progress(Listener):
 
 
 class WrongDelayError(PlanError):
-    """Boards have other antenna delays than those that were given."""
+    """Boards have other antenna delays than the given ones."""
 
 
 class DelayCheck(Listener):
     """Raises `WrongDelayError` if the stamps of a board contradict its given antenna delay.
 
-    Frames are sent on a grid of 512 ticks, and their stamp is this time plus the antenna delay, so that both have the
-    same remainder. The receive delay cannot be seen in stamps.
+    Frames are sent on a grid of 512 ticks, and their stamp is this time plus the antenna delay, so stamp and delay have
+    the same remainder. Stamps do not show the receive delay.
     """
 
     def __init__(self, delays: AntennaDelays) -> None:
@@ -275,7 +277,7 @@ class DelayCheck(Listener):
         self._rests: dict[tuple[int | None, str], deque[int]] = {}
 
     def on_turn(self, turn: Turn) -> None:
-        """Check the stamps of a report; a delay that was confirmed is not checked again."""
+        """Check the stamps of a report; a confirmed delay is not checked again."""
         report = turn.report
         if report is None or not self._expected:
             return
@@ -291,7 +293,8 @@ class DelayCheck(Listener):
             rests.append(rest)
             if not rest:
                 del self._expected[which]
-            # Three reports must contradict a delay alike: the wire has no checksum, and one stamp may be damaged.
+            # Three reports must contradict a delay in the same way: the wire has no checksum, and one stamp may be
+            # damaged.
             elif len(rests) == 3 and len(set(rests)) == 1:
                 board, name = which
                 raise WrongDelayError(
@@ -312,15 +315,15 @@ class ReportCheck:
         """Add a report; returns its differences from the report of the other board, None without any."""
         pair = (report.neighbour, board) if isinstance(report, TargetRangeReport) else (board, report.neighbour)
         before = self._last.pop(pair, None)
-        # Two reports of different exchanges have no stamp in common, but by chance.
+        # Two reports of different exchanges have equal stamps only by chance.
         same = before and any(getattr(before[1], name) == getattr(report, name) != 0 for name in STAMPS)
         if before is None or before[0] == board or not same:
             self._last[pair] = board, report
             return None
         both = ((n, getattr(before[1], n), getattr(report, n)) for n in RangeReport.FIELDS if n != "neighbour")
-        told = ", ".join(f"{name} {one} and {other}" for name, one, other in both if one != other)
+        differences = ", ".join(f"{name} {one} and {other}" for name, one, other in both if one != other)
         whose = f"boards {before[0]} and {board} report one exchange of {pair[0]} with {pair[1]} differently"
-        return f"{whose}: {told}" if told else None
+        return f"{whose}: {differences}" if differences else None
 
 
 CorrectionSource = str | os.PathLike[str] | Correction | Callable[[Exchanges], Columns]
@@ -328,9 +331,9 @@ CorrectionSource = str | os.PathLike[str] | Correction | Callable[[Exchanges], C
 
 
 def load_correction(source: CorrectionSource) -> Correction:
-    """Return a correction as it is, or that of a calibration file.
+    """Return a correction unchanged, or the correction of a calibration file.
 
-    Raises `PlanError`, also if no installed distribution corrects; the correction of a file raises it, too.
+    Raises `PlanError`, also if no installed distribution has a correction, or if loading the file raises it.
     """
     if not isinstance(source, str | os.PathLike):
         return source if isinstance(source, Correction) else Correction(source)
@@ -346,7 +349,7 @@ def load_correction(source: CorrectionSource) -> Correction:
 
 
 def delays_warning(correct: Correction | None, delays: AntennaDelays, tags: Iterable[int] | None = None) -> str:
-    """Return a warning if a correction is for other antenna delays than those programmed now; "" if not, or unknown.
+    """Return a warning if a correction is for other antenna delays than the programmed ones; "" if not, or if unknown.
 
     `tags` are the ranging tags, by default all tags of the correction.
     """
@@ -355,7 +358,7 @@ def delays_warning(correct: Correction | None, delays: AntennaDelays, tags: Iter
 
 
 def check_pairs(correct: Callable[[Exchanges], Columns] | None, pairs: Sequence[tuple[int, int]]) -> None:
-    """Correct one range of each pair, so that the correction raises its error for pairs that it cannot correct."""
+    """Correct one range of each pair, so that the correction raises its error for impossible pairs."""
     if correct and pairs:
         initiator, target = zip(*pairs, strict=True)
         correct(Exchanges.from_arrays(initiator, target, tx1=[0] * len(pairs), rx1=0, tx2=0, rx2=0, range_m=1.0))

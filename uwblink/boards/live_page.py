@@ -1,8 +1,8 @@
 """A live page of a recording: a listener of the recorder, and a server for this computer only.
 
 Plain HTML with pictures in SVG, drawn here and fetched once a second: counts, a row a pair with the last minute of its
-ranges, faults, the disk. Nothing comes from a network, and without scripts the page reloads itself. The server listens
-on the loopback interface only and answers no other host's name.
+ranges, faults, the disk. Nothing is loaded from a network; without scripts the page reloads itself. The server listens
+on the loopback interface only and refuses other host names.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ class LivePage(Closing, Listener):
     """A page that shows the progress of a recording. A context manager: leaving it ends the server."""
 
     def __init__(self, path: Path, *, correct: Callable[[Exchanges], Columns] | None = None, port: int = 0) -> None:
-        """Serve a page about the recording at `path`; port 0 takes any that is free. Raises `PortError`.
+        """Serve a page about the recording at `path`; port 0 selects a free one. Raises `PortError`.
 
-        With `correct` each range is shown corrected, too.
+        With `correct` the page also shows corrected ranges.
         """
         self._path, self._correct = path, correct
         self._progress = Progress()
@@ -68,7 +68,7 @@ class LivePage(Closing, Listener):
         check_pairs(self._correct, pairs)
 
     def watch(self, progress: Progress) -> None:
-        """Show this progress from now on."""
+        """Show this progress."""
         self._progress = progress
 
     def close(self) -> None:
@@ -92,8 +92,8 @@ class LivePage(Closing, Listener):
         """Return the part that changes: name, counts, pairs, faults, disk. The next recorder may have the same port."""
         progress = self._progress
         faults = reversed([*progress.last_faults])
-        told = (f"{_clock(one.time_ns)} board {one.board}: {one.kind}: {one.detail}" for one in faults)
-        items = "".join(f"<li>{escape(text)}</li>" for text in told)
+        lines = (f"{_clock(one.time_ns)} board {one.board}: {one.kind}: {one.detail}" for one in faults)
+        items = "".join(f"<li>{escape(text)}</li>" for text in lines)
         listed = f"<ul>{items}</ul>" if items else ""
         since = f" since {_clock(progress.start_ns)}" if progress.start_ns else ""
         head = f"<h1>recording {escape(self._path.name)}{since}</h1><p>{escape(str(progress))}</p>"
@@ -106,7 +106,8 @@ class LivePage(Closing, Listener):
     def _table(self, progress: Progress) -> str:
         """Return a table with one row for each pair; pairs without ranges for two seconds are highlighted.
 
-        The spread is that of ranges about their neighbours in time: motion hardly changes it at ten ranges a second.
+        The spread is computed from differences to neighbours in time: at ten ranges per second motion hardly changes
+        it.
         """
         kinds = ("range", "corrected") if self._correct else ("range",)
         sigma = ("σ (cm)",) if self._correct else ()
@@ -147,7 +148,7 @@ class LivePage(Closing, Listener):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers for one page."""
+    """HTTP answers for one page."""
 
     timeout = 10.0  # seconds; idle connections are closed, because each has a thread
     page: LivePage
@@ -192,12 +193,12 @@ class _Server(ThreadingHTTPServer):
 
 
 def _clock(time_ns: int) -> str:
-    """Return a host time as the time of day here."""
+    """Return a host time as local time of day."""
     return time.strftime("%H:%M:%S", time.localtime(time_ns * 1e-9))
 
 
 def spread_cm(values: Sequence[float]) -> str:
-    """Return the standard deviation of values about their neighbours as text, "" of fewer than ten.
+    """Return the standard deviation of values about their neighbours as text, "" for fewer than ten values.
 
     Second differences of white noise have six times its variance, and those of a smooth motion are small. Two thirds
     of normal errors lie within a standard deviation.
@@ -209,7 +210,7 @@ def spread_cm(values: Sequence[float]) -> str:
 
 
 def picture(time_ns: Sequence[int], series: Mapping[str, Sequence[float]]) -> str:
-    """Draw series of ranges over time as SVG, with its scale below; a line ends where nothing came for 2 s."""
+    """Draw series of ranges over time as SVG, with its scale below; lines are interrupted after 2 s without a range."""
     if len(time_ns) < 2:
         return ""
     known = [value for values in series.values() for value in values if math.isfinite(value)]

@@ -30,7 +30,7 @@ except ImportError:  # pragma: no cover - Windows has no pseudo-terminals
 
 
 POLL_S: Final = 0.002
-"""How long a port without a descriptor is waited for before others are asked; an exchange takes 4 ms."""
+"""Longest wait at a port without a descriptor before other ports are read; an exchange takes 4 ms."""
 
 
 class Closing:
@@ -39,7 +39,7 @@ class Closing:
     __slots__ = ()
 
     def close(self) -> None:
-        """Close; a derived class says what."""
+        """Close; derived classes implement it."""
 
     def __enter__(self) -> Self:
         """Return the object itself."""
@@ -51,12 +51,12 @@ class Closing:
 
 
 class Transport(Protocol):
-    """What the driver needs of a port; `uwbsim` has one with virtual time."""
+    """Interface of a port for the driver; `uwbsim` has one with virtual time."""
 
     name: str
 
     def read(self, timeout_s: float) -> bytes:
-        """Return received bytes as soon as there are any; empty after the time-out."""
+        """Return received bytes as soon as any arrive; empty after the time-out."""
 
     def write(self, data: bytes) -> None:
         """Send bytes in one write."""
@@ -69,16 +69,16 @@ class Transport(Protocol):
 
 
 class Ports(Protocol):
-    """What a recorder needs of all ports; `uwbsim.VirtualPorts` has virtual time."""
+    """Interface of all ports for a recorder; `uwbsim.VirtualPorts` has virtual time."""
 
     def open(self, name: str) -> Transport:
         """Open a port; raises one of the `PortError`s."""
 
     def wait(self, ports: Sequence[Any], timeout_s: float) -> Sequence[Transport]:
-        """Return those of open ports at which bytes may be waiting, none when the time is over."""
+        """Return the open ports at which bytes may be waiting, none after the time-out."""
 
     def now_s(self) -> float:
-        """Return a time that never goes back, in seconds; that of the ports."""
+        """Return the time of the ports in seconds, which never goes back."""
 
     def host_ns(self) -> int:
         """Return the same time as nanoseconds since the Unix epoch."""
@@ -88,7 +88,7 @@ class Ports(Protocol):
 
 
 def boards_ports() -> list[ListPortInfo]:
-    """Return the serial devices with the boards' USB identity, without opening any."""
+    """Return the serial devices with the boards' USB identity, without opening them."""
     # "STM32 Virtual ComPort" (firmware wire format, 1.1)
     return [port for port in sorted(list_ports.comports()) if (port.vid, port.pid) == (0x0483, 0x5740)]
 
@@ -103,7 +103,7 @@ class SerialPort:
     """An open serial port, locked against a second process."""
 
     def __init__(self, name: str, baud_rate: int = 19_200) -> None:
-        """Open a port; raises one of the `PortError`s, which say what to do. Boards at USB ignore the rate."""
+        """Open a port; raises one of the `PortError`s, which state the remedy. Boards at USB ignore the rate."""
         self.name = name
         self._serial = _opened(name, baud_rate)
         try:
@@ -115,7 +115,7 @@ class SerialPort:
     def read(self, timeout_s: float) -> bytes:
         """Return received bytes as soon as there are any; raises `PortLostError`.
 
-        Empty after the time-out, and after `POLL_S` where a port has no descriptor.
+        Empty after the time-out, and after `POLL_S` if a port has no descriptor.
         """
         if self.fileno is not None and not select.select([self.fileno], [], [], max(timeout_s, 0.0))[0]:
             return b""
@@ -132,7 +132,7 @@ class SerialPort:
         return time.monotonic()
 
     def close(self) -> None:
-        """Close the port; harmless when it is lost."""
+        """Close the port, also if it is lost."""
         with contextlib.suppress(OSError, serial.SerialException, TypeError):
             self._serial.close()
 
@@ -142,7 +142,9 @@ class SerialPort:
 
 
 def _since_boot_ns() -> int:
-    """Return a clock that is never set and runs while the computer is suspended, if the system has one."""
+    """Return the time of a clock that is never set and also runs while the computer is suspended, if the system has
+    one.
+    """
     boot = getattr(time, "CLOCK_BOOTTIME", None)
     return time.monotonic_ns() if boot is None else time.clock_gettime_ns(boot)
 
@@ -153,7 +155,7 @@ class SerialPorts:
     def __init__(self, baud_rate: int = 19_200) -> None:
         """Start the clock. Ports are opened at a rate."""
         self._baud_rate = baud_rate
-        # No change of the wall clock moves the times of a recording.
+        # Changes of the wall clock do not change the times of a recording.
         self._epoch_ns = time.time_ns() - _since_boot_ns()
 
     def open(self, name: str) -> SerialPort:
@@ -161,7 +163,7 @@ class SerialPorts:
         return SerialPort(name, self._baud_rate)
 
     def wait(self, ports: Sequence[Any], timeout_s: float) -> Sequence[SerialPort]:
-        """Return ports at which bytes may be waiting; those without a descriptor must be asked again and again."""
+        """Return ports at which bytes may be waiting; ports without a descriptor must be polled."""
         polled = [port for port in ports if port.fileno is None]
         watched = {port.fileno: port for port in ports if port.fileno is not None}
         timeout_s = min(timeout_s, POLL_S) if polled else timeout_s
@@ -176,7 +178,7 @@ class SerialPorts:
         return self._epoch_ns + _since_boot_ns()
 
     def moved(self, name: str, number: str | None) -> str | None:
-        """Return what a port is called now: the old name, or another of the board with this USB serial number."""
+        """Return the present name of a port: the old name, or another one of the board with this USB serial number."""
         if "://" in name or os.path.exists(name):
             return name
         return next((p.device for p in boards_ports() if number and p.serial_number == number), None)
@@ -192,13 +194,13 @@ def _opened(name: str, baud_rate: int) -> Any:
     except ValueError as error:
         raise PortError(f"{name}: not a port ({error})") from error
     except (OSError, serial.SerialException) as error:
-        raise _explained(name, error) from error
+        raise _port_error(name, error) from error
     with contextlib.suppress(OSError, serial.SerialException, NotImplementedError):
         port.reset_input_buffer()
     return port
 
 
-def _explained(name: str, error: Exception) -> PortError:
+def _port_error(name: str, error: Exception) -> PortError:
     """Return the error of a port that cannot be opened."""
     code = errno.EISDIR if os.path.isdir(name) else getattr(error, "errno", None)
     if "configure port" in str(error):
@@ -223,7 +225,7 @@ def _explained(name: str, error: Exception) -> PortError:
 
 
 def wait_until(due_s: float, stop: Callable[[], bool]) -> bool:
-    """Wait for a time of the monotonic clock; returns False if `stop` returned true before."""
+    """Wait until a time of the monotonic clock; returns False if `stop` returned true before."""
     while (wait_s := due_s - time.monotonic()) > 0:
         if stop():
             return False
@@ -232,10 +234,11 @@ def wait_until(due_s: float, stop: Callable[[], bool]) -> bool:
 
 
 class Terminal:
-    """A pseudo-terminal that stands in for a serial port: opened raw, linked under a stable name, and unplugged.
+    """A pseudo-terminal that replaces a serial port: it is opened raw, has a link with a stable name, and can be
+    unplugged.
 
-    The far end behaves like the boards' USB: bytes that do not fit because no client reads are lost, and an unplugged
-    port has no name. `name` is what a client opens: the link if there is one, else the device's path.
+    The far end behaves like the boards' USB: bytes are lost if no client reads and the buffer is full, and an unplugged
+    port has no name. `name` is the path that a client opens: the link if there is one, else the device.
     """
 
     def __init__(self, link: Path | None = None) -> None:
@@ -263,7 +266,7 @@ class Terminal:
         """Open the port, unless it is open."""
         if self._ends:
             return
-        # The client's end stays open here too: otherwise a read fails whenever no client has it open.
+        # The client's end is also kept open here: otherwise reads fail if no client has it open.
         near, far = pty.openpty()
         tty.setraw(far)
         os.set_blocking(near, False)
@@ -272,7 +275,7 @@ class Terminal:
             _point(self._link, os.ttyname(far))
 
     def unplug(self) -> None:
-        """Close the port, as pulling the cable does: clients get an error, the link is gone."""
+        """Close the port, like a pulled cable: clients get an error, and the link is removed."""
         if not self._ends:
             return
         if self._link:
@@ -283,7 +286,7 @@ class Terminal:
         self._ends = None
 
     def read(self) -> bytes:
-        """Return what the client has written, without waiting."""
+        """Return bytes that the client has written, without waiting."""
         with contextlib.suppress(OSError):
             if self._ends:
                 return os.read(self._ends[0], 65_536)
@@ -302,6 +305,6 @@ def _point(link: Path, device: str) -> None:
         raise PortError(f"{link}: is a port in use by another server; choose another folder, or remove the link")
     with raising(PortError, f"{link}: cannot be made a link to {device}"):
         link.parent.mkdir(parents=True, exist_ok=True)
-        if link.is_symlink():  # left behind by a server that was killed
+        if link.is_symlink():  # remains of a server that was killed
             link.unlink()
         link.symlink_to(device)

@@ -57,11 +57,11 @@ PLAN_KEYS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class RangingPlan:
-    """A ranging plan: `pairs` of (initiator, target) in the order in which they take turns, "all", or () to listen.
+    """A ranging plan: `pairs` of (initiator, target) in the order of their turns, "all", or () to listen.
 
-    `rate_hz` is exchanges a second in total, by default as many as the boards answer. `tags` are places of boards, and
-    `antenna_delays` the programmed delays (under None: of boards not named), by default 16436 ticks for all.
-    Raises `PlanError` for a plan that cannot be executed.
+    `rate_hz` is the number of exchanges per second in total, by default as fast as the boards answer. `tags` are places
+    of boards, and `antenna_delays` the programmed delays (under None: of boards not named), by default 16436 ticks for
+    all. Raises `PlanError` for a plan that cannot be executed.
 
     >>> import uwblink
     >>> uwblink.RangingPlan().turns([10, 20, 30])
@@ -109,7 +109,7 @@ class RangingPlan:
     def turns(self, present: Sequence[int]) -> tuple[tuple[int, int], ...]:
         """Return the pairs to range, none to only listen; raises `PlanError` with the names of absent boards.
 
-        "all" means every two boards once, except two on one body, which have a fixed distance.
+        "all" means each pair of boards once, except pairs on one body, which have a fixed distance.
         """
         if self.pairs == "all":
             body = {tag.tag: tag.body for tag in self.tags}

@@ -30,7 +30,7 @@ from uwblink.wire.codec import exchanges_of
 from uwblink.wire.messages import Cir, Overheard
 
 LONGEST_BACKLOG_S: Final = 20.0
-"""Longest delay of the disk that is tolerated; busy disks take a second or two."""
+"""Longest tolerated delay of the disk; busy disks need a second or two."""
 
 LONG_LOG: Final = 8 * 2**20
 """Half of the size at which DuckDB checkpoints its log within a commit, which takes a second on a busy machine."""
@@ -113,13 +113,13 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
                 mark = replace(mark, start_ns=first_ns, end_ns=max(using.host_ns(), first_ns + 1))
                 recording.append("arrangements", [mark])
     except WrongDelayError:
-        path.unlink(missing_ok=True)  # its `meta` would say wrong antenna delays
+        path.unlink(missing_ok=True)  # its `meta` would contain wrong antenna delays
         raise
     return recorder.progress
 
 
 def _check_boards(found: Mapping[int, str], plan: RangingPlan, mark: Arrangement) -> None:
-    """Raise `PlanError` for an arrangement that cannot be, an order or places of tags that are of other boards."""
+    """Raise `PlanError` for an impossible arrangement, and for an order or places of tags of absent boards."""
     if mark.known not in SHAPES or (mark.known and not mark.name):
         raise PlanError(
             f"found {mark.known!r:.40}, allowed: line, plane, and only for an `arrangement` with a name",
@@ -163,7 +163,7 @@ def identify(names: Iterable[str], ports: Ports | None = None) -> dict[int, str]
 
 
 Row = FrameRow | Fault | Heard
-"""What a recording stores of what its boards send."""
+"""Tables of a recording for messages of boards."""
 
 
 def append_rows(recording: Recording, rows: Sequence[Row]) -> None:
@@ -186,17 +186,16 @@ def append_rows(recording: Recording, rows: Sequence[Row]) -> None:
 
 
 def overheard_row(time_ns: int, listener: int, heard: Overheard) -> dict[str, Any]:
-    """Return the row of the table `overheard` of a message; what it lacks is NaN."""
+    """Return the row of the table `overheard` of a message; missing values are NaN."""
     values = ((name, getattr(heard, name)) for name in Overheard.FIELDS)
     return {"time_ns": time_ns, "listener": listener} | {n: np.nan if v is None else v for n, v in values}
 
 
 class RecordingWriter(Closing, Listener):
-    """A listener that writes a live recording. A context manager: leaving it writes what is left.
+    """A listener that writes a live recording. A context manager: leaving it writes the remaining rows.
 
-    A thread commits every 0.1 s, which is the longest stretch that a power cut loses, so that a slow disk does not make
-    the recorder miss bytes. `behind_s` is the time since the last commit, without the time for which this process was
-    stopped.
+    A thread commits every 0.1 s, so that a slow disk does not make the recorder miss bytes; a power cut loses no more
+    than this time. `behind_s` is the time since the last commit, without the time for which this process was stopped.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -224,11 +223,11 @@ class RecordingWriter(Closing, Listener):
 
     @property
     def waiting(self) -> int:
-        """Number of rows that wait to be written."""
+        """Number of rows that are not written yet."""
         return self._rows.qsize()
 
     def check(self) -> None:
-        """Raise `RecordingError` when nothing can be written any more, or the disk cannot keep up."""
+        """Raise `RecordingError` if writing has failed, or the disk is too slow."""
         if self._error:
             raise self._error
         now_s = time.monotonic()
@@ -261,7 +260,7 @@ class RecordingWriter(Closing, Listener):
                             shortening = other.submit(self._recording.shorten_log)
                 except RecordingError as error:
                     self._error = error
-                except Exception as error:  # it would end the thread unnoticed
+                except Exception as error:  # otherwise it would end the thread silently
                     self._error = RecordingError(
                         f"{path}: cannot be written any more ({type(error).__name__}: {error}). "
                         "What was written before is kept"
@@ -270,7 +269,7 @@ class RecordingWriter(Closing, Listener):
                     break
 
     def _write(self) -> None:
-        """Commit the rows that wait; raises `RecordingError` if the file was removed or replaced."""
+        """Commit the waiting rows; raises `RecordingError` if the file was removed or replaced."""
         path = self._recording.path
         if rows := [self._rows.get() for _ in range(self._rows.qsize())]:
             with self._recording.transaction():

@@ -1,7 +1,7 @@
 """The recorder: executes a ranging plan on boards and passes all traffic to its listeners.
 
 One loop waits for bytes from all ports and for the next turn of the plan; exchanges take turns, because two at once
-would collide on the air. A board that is unplugged leaves the others running and is taken back when it returns.
+would collide on the air. If a board is unplugged, the others continue; it is used again after it returns.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from uwblink.wire.codec import LONGEST_LINE, Event
 from uwblink.wire.messages import GetId, IdReport, Message, RangeCommand, RangeReport, SetPassive, Skipped, TextLine
 
 LONGEST_WAIT_S: Final = 0.05
-"""Longest time between two checks whether to stop."""
+"""Longest time between two checks of the stop condition."""
 
 
 class Station:
     """State of a board's port; `port` is None while it is unplugged."""
 
     def __init__(self, board: int, name: str, ports: Ports, *, passive: bool) -> None:
-        """Open the port; raises `PortError`. A `passive` board is told to listen, again whenever it comes back."""
+        """Open the port; raises `PortError`. A `passive` board gets the command to listen, also after it returns."""
         self.board, self.name = board, name
         self.serial_number = serial_number(name)
         self._ports, self._passive = ports, passive
@@ -39,9 +39,8 @@ class Station:
         self._plug(name)
 
     def next_command(self, now_s: float, ranging: RangeCommand | None = None) -> Message | None:
-        """Return the command that is due, None if the board cannot take one now.
-
-        A fence comes first if a late answer is possible, then the board is set up, and only then it may range.
+        """Return the command that is due, None if the board cannot take one now. A fence is first if a late answer is
+        possible, then set-up commands, then exchanges.
         """
         idle = self.port is not None and not self.connection.busy and self.connection.ready_s(now_s) <= 0
         if not idle or now_s < self.pause_until_s:
@@ -51,7 +50,7 @@ class Station:
         return self._todo.popleft() if self._todo else ranging
 
     def gather_damage(self, event: Event) -> str | None:
-        """Gather bytes that are no message; returns a description of them when a damaged line is over.
+        """Gather bytes that are not messages; returns their description at the end of a damaged line.
 
         The decoder skips a damaged line in several pieces. The line ends with a message, a line end, or too many bytes.
         """
@@ -69,10 +68,10 @@ class Station:
         self.port, self._retry_s = None, now_s + 0.2
 
     def plug_again(self, now_s: float) -> bool:
-        """Try to reopen the port, under a new name if its device has one; returns whether it is open."""
+        """Try to reopen the port, also under a new name of its device; returns whether it is open."""
         if self.port is not None or now_s < self._retry_s:
             return False
-        self._retry_s = now_s + 0.2  # the system needs time to find a device that was plugged in
+        self._retry_s = now_s + 0.2  # the system needs time to find a new device
         name = self._ports.moved(self.name, self.serial_number)
         with suppress(PortError):
             if name is not None:
@@ -88,7 +87,7 @@ class Station:
 
 
 class Recorder(Closing):
-    """The loop of a recording: `boards` maps ids to ports, `turns` are the pairs that take turns."""
+    """The loop of a recording: `boards` maps ids to ports, `turns` are the pairs in order."""
 
     def __init__(
         self,
@@ -141,14 +140,14 @@ class Recorder(Closing):
             yield now_s
 
     def finish(self) -> None:
-        """Let the last exchange end, and begin no other."""
+        """Wait for the end of the last exchange, and begin no other."""
         self._turns = ()
         while self._active:
             self._step(self._ports.now_s() + LONGEST_WAIT_S)
         self.progress.time_s = self._ports.now_s() - self._start_s
 
     def close(self) -> None:
-        """Stop the boards' listening and close the ports; the listeners are their owner's to close."""
+        """Stop the boards' listening and close the ports; the caller closes the listeners."""
         for station in self._stations.values():
             if station.port is None:
                 continue
@@ -195,7 +194,7 @@ class Recorder(Closing):
             station = self._stations[pair[0]]
             wanted = RangeCommand(pair[1], plan.target_reports, plan.protocol == "ds", plan.get_cir)
             if self._stations[pair[1]].port is not None and station.next_command(now_s, wanted):
-                # A late turn is not followed by a burst.
+                # After a late turn, missed turns are not made up.
                 self._next_s = max(self._next_s + (1 / plan.rate_hz if plan.rate_hz else 0.0), now_s)
                 self._active = station, pair
                 self._send(station, wanted)
@@ -212,7 +211,7 @@ class Recorder(Closing):
             self._report_lost(station, error)
 
     def _receive(self, station: Station, port: Transport, *, waiting: bool) -> None:
-        """Read bytes that are waiting, and end the board's command if they or the time ended it."""
+        """Read waiting bytes, and end the board's command if they complete it or it timed out."""
         try:
             data = port.read(0.0) if waiting else b""
         except PortLostError as error:
@@ -236,7 +235,7 @@ class Recorder(Closing):
             self._fault(station, "garbage", damage)
         if isinstance(event, Skipped):
             return
-        # Lines that accompany failed exchanges are expected; all others are faults.
+        # Lines of failed exchanges are expected; all others are faults.
         expected = ("WARNING", "COMMANDED TASK FAILED", "TWR FAIL")
         if isinstance(event, TextLine) and not event.text.startswith(expected):
             self._fault(station, "text", event.text.strip())

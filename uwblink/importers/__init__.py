@@ -1,8 +1,8 @@
 """Import of files in other formats; programs and other distributions can register importers of their own.
 
 A registered reader takes a path and a map and returns `Contents`, or tables with a map. This module writes the
-recording, and overwrites one only with `force`. It also reads back what `uwblink export --to csv` or
-`parquet` wrote, and data frames of pandas, Polars or Arrow, by DuckDB alone.
+recording, and overwrites an existing one only with `force`. It also reads exports of `uwblink export --to csv` or
+`parquet`, and data frames of pandas, Polars or Arrow, with DuckDB alone.
 """
 
 from __future__ import annotations
@@ -53,15 +53,15 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Importer:
-    """A kind of file that can become a recording; it has a function `read` or `tables`.
+    """A kind of file that can be imported; it has a function `read` or `tables`.
 
-    `read(source, map)` returns what the file at `source` holds and raises `ImportTableError`; `map` is the path of a
-    file that explains it, for kinds with a `map_help`, else None. `suffixes` are what names of such files end with, in
-    small letters, none for a kind of folder; `name` is that of the command `uwblink import NAME`, and `help` its line.
+    `read(source, map)` returns the contents of the file at `source` and raises `ImportTableError`; `map` is the path of
+    a file that explains it, for kinds with a `map_help`, else None. `suffixes` are the suffixes of such files in small
+    letters, none for a kind of folder; `name` is the name of the command `uwblink import NAME`, and `help` its line.
 
-    `tables(sources, map, folder)` returns paths of tables of exchanges, messages or ranges, and their `ColumnMap`.
-    Files that are no tables are written as such into `folder`, for example as JSON lines; none needs to be in memory
-    as a whole. With `several` it takes several files as one recording, otherwise one.
+    `tables(sources, map, folder)` returns paths of tables of exchanges, messages or ranges, and their `ColumnMap`. It
+    writes files that are not tables as tables into `folder`, for example as JSON lines; no table needs to be in memory
+    as a whole. With `several` it reads several files as one recording, otherwise one file.
     """
 
     name: str
@@ -122,7 +122,7 @@ def read_exported(folder: Path, _map_file: Path | None = None) -> Contents:
 
 
 def _query(db: duckdb.DuckDBPyConnection, table: str, source: Path) -> str:
-    """Return the query that reads an exported table; text from the file never becomes part of it."""
+    """Return the query that reads an exported table; text from the file is never part of it."""
     is_csv = source.suffix == ".csv"
     read = (
         "read_csv(?, auto_detect=true, all_varchar=true, header=true, delim=',', quote='\"', escape='\"', nullstr='', "
@@ -140,7 +140,7 @@ def _query(db: duckdb.DuckDBPyConnection, table: str, source: Path) -> str:
             f"{source}: lacks the columns {', '.join(lacking)}; {table} has {', '.join(TABLES[table])}"
         )
     if table == "exchanges" and TRUTH_FROM in names:
-        # Distances by poses are left out, because the poses are imported, too.
+        # Distances by poses are left out, because the poses are also imported.
         cells["truth_m"] = f"CASE WHEN {TRUTH_FROM} = '{BY_POSES}' THEN NULL ELSE {cells['truth_m']} END"
     return f"SELECT {selected(cells)} FROM {read}"  # noqa: S608 - keys of TABLES
 
@@ -183,8 +183,8 @@ IMPORTERS: Final[Registry[Importer]] = Registry(
 def register_importer(row: Importer, *, replace: bool = False) -> None:
     """Add a kind of file to `IMPORTERS`, for `import_recording` and the command `uwblink import`.
 
-    `replace` puts it in place of one registered before. Raises `ArgumentError` for a name that is taken, and for a row
-    that cannot work.
+    With `replace` it replaces a registered one. Raises `ArgumentError` for a name that is taken, and for a row that
+    cannot work.
 
     >>> import uwblink
     >>> from uwblink.importers import IMPORTERS, Importer
@@ -200,10 +200,10 @@ def register_importer(row: Importer, *, replace: bool = False) -> None:
 
 
 Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
-"""A path, or several of a kind of which several can be one recording."""
+"""A path, or several paths of a kind that allows several files."""
 
 MapSource = str | os.PathLike[str] | Mapping[str, Any]
-"""What explains the columns of a table: the path of a map, or for a data frame also its keys."""
+"""Explanation of the columns of a table: the path of a map, or for a data frame also its keys."""
 
 
 def import_recording(
@@ -216,8 +216,8 @@ def import_recording(
 ) -> int:
     """Import a file, several tables as one, or a data frame into a new recording; returns the number of exchanges.
 
-    `importer` names a row of `IMPORTERS`; without it the name of the file decides. `map_file` explains a table's
-    columns. A data frame is one of pandas or Polars, or another object with Arrow's interface in C; without a map, one
+    `importer` names a row of `IMPORTERS`; by default the name of the file determines it. `map_file` explains a table's
+    columns. A data frame is one of pandas or Polars, or another object with Arrow's interface in C; without a map, it
     is guessed as by `uwblink import guess`. Raises `ArgumentError`, `ImportTableError` and what `Recording.create`
     raises; nothing is written then.
 
@@ -239,10 +239,10 @@ def import_file(
     force: bool = False,
     watch: Watch = unwatched,
 ) -> Imported:
-    """Do what `import_recording` does; returns what was imported.
+    """Import like `import_recording`; returns the numbers of imported rows.
 
-    `watch` is called with what is being done ("reading", "checking", "writing", and between the first two "sorting" and
-    "grouping" where an exchange has several rows) and which share of it is done, by importers that say so.
+    `watch` is called with the current step ("reading", "checking", "writing", and between the first two "sorting" and
+    "grouping" if an exchange has several rows) and its completed share, by importers that report it.
     """
     check_output(Path(output), force=force, recording=True)
     if is_frame(source):
@@ -282,7 +282,7 @@ def read_source(source: Source | Any, *, importer: str | None = None, map_file: 
 
 @contextmanager
 def _folder(named: str) -> Iterator[Path]:
-    """Return a folder for what an import writes for itself; errors have a name instead of its files."""
+    """Return a folder for temporary files of an import; errors name the source instead of these files."""
     with TemporaryDirectory(prefix="uwblink-") as folder:
         try:
             yield Path(folder)
@@ -315,7 +315,7 @@ def _choose(
 
 def _write_frame(frame: Any, folder: Path) -> Path:
     """Write a data frame as Parquet into a folder, named indices as columns; raises `ImportTableError`."""
-    path = folder / "data frame.parquet"  # what recordings call it
+    path = folder / "data frame.parquet"  # the name of the source in the recording
     if any(name is not None for name in getattr(getattr(frame, "index", None), "names", [])):
         frame = frame.reset_index()
     with (
@@ -329,9 +329,9 @@ def _write_frame(frame: Any, folder: Path) -> Path:
 
 
 def _map_of_frame(table: Path, given: str | os.PathLike[str] | Mapping[str, Any] | None) -> Path:
-    """Return the path of the map of a written frame: the given one, one that says what a mapping says, or a guess.
+    """Return the path of the map of a written frame: the given one, one with the contents of a mapping, or a guess.
 
-    Raises `ImportTableError` where the frame does not tell everything, with what is missing.
+    Raises `ImportTableError` that names missing values if the frame does not contain all.
     """
     if isinstance(given, str | os.PathLike):
         return Path(given)

@@ -1,9 +1,9 @@
 """Bags of ROS 1, ROS 2 and MCAP: their messages, and exchanges in them by a map of the messages' fields.
 
 Each message becomes a row of a table. Its columns are the fields of the message, such as `header.frame_id`; times
-(`header.stamp`) are whole nanoseconds, and the elements of an array are `stamps.0`, `stamps.1` and so on. `topic` and
-`log_time` are columns, too, and the places of a topic that is a template; the fields of JSON in a `std_msgs/String` are
-those of the message. The table is then read as JSON lines. The project's own MCAP files and bags need no map.
+(`header.stamp`) are whole nanoseconds, and the elements of an array are `stamps.0`, `stamps.1` and so on. Further
+columns are `topic`, `log_time`, and the places of a topic that is a template; the fields of JSON in a `std_msgs/String`
+are fields of the message. The table is then read as JSON lines. The project's own MCAP files and bags need no map.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from uwblink.text_files import require_regular
 
 BAG_SUFFIXES: Final = (".bag", ".mcap", ".db3")
 MAX_RECORD_BYTES: Final = 2**28
-"""Largest record and largest unpacked chunk, which are both held in memory. Writers make chunks of a few MB."""
+"""Largest record and largest unpacked chunk; both are held in memory. Writers make chunks of a few MB."""
 
 OWN_COLUMNS: Final = {
     "from_id": "initiator", "to_id": "target", "range_m": "range_m", "gt_range_m": "truth_m",
@@ -58,7 +58,7 @@ class Bag:
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path is a bag by its suffix, or a folder with the files of one."""
+    """Return whether a path is a bag by its suffix, or a folder with the files of a bag."""
     named = [path] if not path.is_dir() else [part for part in path.iterdir() if part.suffix != ".bag"]
     return any(part.suffix.lower() in BAG_SUFFIXES for part in named)
 
@@ -138,7 +138,7 @@ def _channels(path: Path) -> Iterator[tuple[int, str, str, str]]:
 
 def _records(path: Path) -> Iterator[McapRecord]:
     """Yield the records of a file, and of its chunks; raises `ImportTableError` for a file that is damaged."""
-    # The library passes on whatever its decompressors raise of damaged data.
+    # The library passes on all exceptions of its decompressors for damaged data.
     damaged = raising(
         ImportTableError, f"{path}: is cut off or damaged", Exception, remedy="; was it written to the end?"
     )
@@ -183,7 +183,7 @@ def bag_to_table(sources: Sequence[Path], map_file: Path | None, folder: Path) -
 
 
 def _with_topics(bag: Bag, column_map: ColumnMap) -> ColumnMap:
-    """Return a map that names topics: its own, those of the project's own ranges, or the only one there is."""
+    """Return a map that names topics: the map's own, the topics of exported ranges, or the only topic."""
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.kinds.items()))[:400] or "none"
     topics: dict[str, dict[str, float | str]] = {}
     for stated, constants in column_map.topics.items():
@@ -206,7 +206,7 @@ def _with_topics(bag: Bag, column_map: ColumnMap) -> ColumnMap:
 
 
 def matching_topics(stated: str, topics: Iterable[str]) -> dict[str, dict[str, float | str]]:
-    """Return the topics that are called so, or that a template matches, with the values of its places."""
+    """Return the topics with this name, or those that a template matches, with the values of its places."""
     listed = list(topics)
     if stated in listed or not is_template(stated):
         return {stated: {}} if stated in listed else {}
@@ -216,13 +216,13 @@ def matching_topics(stated: str, topics: Iterable[str]) -> dict[str, dict[str, f
 def _rows(bag: Bag, topics: Mapping[str, dict[str, float | str]]) -> Iterator[dict[str, Any]]:
     """Yield one row for each message."""
     for topic, kind, time_ns, message in bag.messages(topics):
-        # The project's own messages leave out unknown values.
+        # Exported messages omit unknown values.
         own = dict.fromkeys(OWN_COLUMNS.values()) if kind == RANGE or topic == EXCHANGES else {}
         yield {**own, **fields_of(kind, message), "topic": topic, "log_time": time_ns, **topics[topic]}
 
 
 def fields_of(kind: str, message: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of a message; those of a text that is an object of JSON."""
+    """Return the fields of a message, or of the object of JSON in its text."""
     if kind == STRING:
         with suppress(KeyError, TypeError, ValueError, RecursionError):
             parsed = _plain(json.loads(message["data"]))
@@ -241,7 +241,7 @@ def _plain(value: Any) -> Any:
             return int(whole[0]) * 1_000_000_000 + int(whole[1])
         return {name: _plain(one) for name, one in value.items()}
     if isinstance(value, np.ndarray):
-        short = value.size <= 16  # longer ones are images and the like
+        short = value.size <= 16  # longer arrays are images or similar data
         return {str(k): _plain(one) for k, one in enumerate(value.tolist())} if short else None
     if isinstance(value, list | tuple):
         return [_plain(one) for one in value]

@@ -67,7 +67,7 @@ TEMPERATURES: Final = ("from_temperature_c", "to_temperature_c")
 IDS: Final = {"from_id": "the initiator of each exchange", "to_id": "its target"}
 ALL_IDS: Final = IDS | {"at_id": "the tag at which a difference of arrival was measured"}
 SIGN: Final = "a difference is the distance from at_id to to_id minus that to from_id"
-"""The meaning of the order of the ids of a difference of arrival."""
+"""Explanation of the order of the ids of a difference of arrival."""
 
 ASKED: Final = "?"
 """Placeholder of `uwblink import guess` for a value that the user must give."""
@@ -77,7 +77,7 @@ NAMES: Final = (
     *TEMPERATURES,
     "sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "sts", "stamp", "event", "heard",
 )  # fmt: skip
-"""The columns of tables; `event` has words that tell whether a stamp is of transmission or of reception."""
+"""The columns of tables; `event` has words for a stamp of transmission or of reception."""
 
 STAMP_UNITS: Final = {
     "ticks": 1.0,
@@ -101,7 +101,7 @@ KINDS: Final = (
     | dict.fromkeys(POWERS, "power")
     | dict.fromkeys(SKEWS, "skew")
 )
-"""The kind of each column; those with units have the name of their key in `units`."""
+"""The kind of each column; columns with units have the name of their key in `units`."""
 
 UNITS_BY_KEY: Final[dict[str, Mapping[str, float]]] = (
     {"stamps": STAMP_UNITS, "time": TIME_UNITS | {"iso": 1.0}, "skew": CHIPS["other"].skew_ppm}
@@ -109,7 +109,7 @@ UNITS_BY_KEY: Final[dict[str, Mapping[str, float]]] = (
     | dict.fromkeys(("range_m", "difference_m"), DISTANCE_UNITS | FLIGHT_UNITS)
     | {name: {"dBm": 1.0, "-dBm": -1.0} for name in ("power", *POWERS)}
 )
-"""Units by key of `units`, for a kind of columns or one column: what a unit is in ticks, ns, m, dBm or ppm."""
+"""Units by key of `units`, for a kind of columns or one column: the value of a unit in ticks, ns, m, dBm or ppm."""
 MAP_KEYS: Final = (
     FileKey(
         "layout",
@@ -297,7 +297,7 @@ class ColumnMap:
         return self.units.get(name, "dBm" if name in self.registers else self.units.get(KINDS[name]))
 
     def factor(self, name: str) -> float:
-        """Return what a column of `NAMES` is multiplied by, so that it is in ticks, m, dBm or ppm."""
+        """Return the factor that converts a column of `NAMES` to ticks, m, dBm or ppm."""
         known = UNITS_BY_KEY | {"skew": CHIPS[self.chip or "other"].skew_ppm}
         units, unit = known.get(name, known.get(KINDS[name], {})), self.unit_of(name)
         return unit * TICKS_PER_SECOND if is_number(unit) else units.get(unit, 1.0)
@@ -323,7 +323,9 @@ def load_map(path: Path) -> ColumnMap:
     if known := LINES.get(table.get("line", "")):
         file.table = table = known | table | {"line": known["line"]}
     columns, units, constants, ids, wide = (file.section(n) for n in ("columns", "units", "constants", "ids", "wide"))
-    file.known(columns, (*NAMES, "body", *POSE), "columns.")  # the last are of poses, for `uwblink poses --map`
+    file.known(
+        columns, (*NAMES, "body", *POSE), "columns."
+    )  # the last names are columns of poses, for `uwblink poses --map`
     file.known(wide, NAMES, "wide.")
     templates = [
         name for name in ("line", "from_name", "each") if name in table and (name != "each" or "line" in table)
@@ -375,7 +377,7 @@ def load_map(path: Path) -> ColumnMap:
 
 
 def _check_columns(file: TomlReader, columns: dict[str, Any], wide: dict[str, Any], chip: str | None) -> None:
-    """Raise the file's error for names of columns, registers and families that cannot be."""
+    """Raise the file's error for invalid names of columns, registers and families."""
     registers = {name: value for name, value in columns.items() if isinstance(value, dict)}
     for name, value in registers.items():
         file.known(value, REGISTERS, f"columns.{name}.")
@@ -397,7 +399,7 @@ def _check_columns(file: TomlReader, columns: dict[str, Any], wide: dict[str, An
 
 
 def _check_values(file: TomlReader, ids: dict[str, Any]) -> None:
-    """Raise the file's error for values that mean none, constants, topics and numbers of ids that cannot be."""
+    """Raise the file's error for invalid markers of missing values, constants, topics and numbers of ids."""
     missing, within = file.table.get("missing", []), file.table.get("within_s", 1.0)
     listed = isinstance(missing, list) and all(
         is_number(one) or (isinstance(one, str) and one != ASKED) for one in missing
@@ -413,7 +415,7 @@ def _check_values(file: TomlReader, ids: dict[str, Any]) -> None:
 
 
 def _place(place: str, columns: dict[str, Any], units: dict[str, Any]) -> None:
-    """State which column a place such as `gt_range_cm` is, and its unit."""
+    """Return the column of a place such as `gt_range_cm`, and its unit."""
     stem, _, unit = place.rpartition("_")
     for name in ("time_s", *DISTANCES):
         if stem == name.rpartition("_")[0] and unit in UNITS_BY_KEY[name if name in UNITS_BY_KEY else "time"]:

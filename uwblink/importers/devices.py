@@ -1,17 +1,17 @@
-"""What the importers know of devices: chips (powers from registers, clock offsets, limits), and printed lines.
+"""Facts about devices for importers: chips (powers from registers, clock offsets, limits), and printed lines.
 
 DW1000: User Manual 2.18, section 4.7.1 for the first path, 10 log10((F1^2 + F2^2 + F3^2) / N^2) - A, and 4.7.2 for the
 total, 10 log10(C 2^17 / N^2) - A, with A = 113.77 dB or 121.74 dB at a pulse repetition frequency of 16 or 64 MHz.
 DW3000: User Manual, section 4.7: 6 D dB are added for the decision D of the digital gain control, amplitudes have two
 fractional bits, C is multiplied by 2^21, and A = 113.8 dB or 121.7 dB. These were taken from the vendor's driver, whose
 comments refer to the manual; 2^21 holds for the DW3000, 2^17 for later chips of the family. No board with a DW3000 was
-tried. The vendor's examples contradict each other on the sign of its clock offset: positive if the receiver's clock is
-faster by that of crystal trimming ("offset"), slower by that of single-sided ranging ("-offset"). Both chips count
-ticks of 15.65 ps on 40 bits.
+tried. The vendor's examples contradict each other on the sign of its clock offset: it is positive for a faster clock of
+the receiver in the example of crystal trimming ("offset"), for a slower one in the example of single-sided ranging
+("-offset"). Both chips count ticks of 15.65 ps with 40 bits.
 
-Lines are templates that `uwblink import guess` tries, and that a map can name. The forms are those of public firmware:
-the shell of the DWM1001 (`les`, `lec`), AT commands of ESP32 modules, examples of the Arduino library for the DW1000,
-and the reports of EVK1000 and TREK1000 (hexadecimal millimetres, a bit of the mask for each range).
+Lines are templates that `uwblink import guess` tries, and that a map can name. The forms are from public firmware: the
+shell of the DWM1001 (`les`, `lec`), AT commands of ESP32 modules, examples of the Arduino library for the DW1000, and
+the reports of EVK1000 and TREK1000 (hexadecimal millimetres, a bit of the mask for each range).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any, Final
 
 @dataclass(frozen=True, slots=True)
 class Chip:
-    """A chip: formula of its powers, its offsets of clocks by ppm per unit, and the powers that it reports."""
+    """A chip: formula of its powers, its clock offsets in ppm per unit, and the powers that it reports."""
 
     offset_db: Mapping[int, float]
     """A, by pulse repetition frequency in MHz; none for chips whose registers are not known."""
@@ -37,7 +37,7 @@ class Chip:
     gain_db: float = 0.0
     """Power for each step of the gain register."""
     power_dbm: tuple[float, float] = (-150.0, 0.0)
-    """Limits of received powers; what is sent has -41.3 dBm/MHz by law, -14 dBm in 500 MHz."""
+    """Limits of received powers; transmitted power is at most -41.3 dBm/MHz by law, -14 dBm in 500 MHz."""
 
 
 _PPM: Final = {"ppm": 1.0, "-ppm": -1.0}
@@ -63,11 +63,11 @@ CHIPS: Final = {
 }
 
 REGISTERS: Final = ("f1", "f2", "f3", "n", "c", "d")
-"""Registers of powers: amplitudes of the first path, preamble count, power of the impulse response, gain decision."""
+"""Registers for powers: amplitudes of the first path, preamble count, power of the impulse response, gain decision."""
 
 
 def power_sql(chip: Chip, prf_mhz: int, cells: Mapping[str, str]) -> str:
-    """Return SQL of a power in dBm from SQL of registers: of the first path if `f1` is there, else of all (`c`)."""
+    """Return SQL of a power in dBm from SQL of registers: first-path power if `f1` is given, else total power (`c`)."""
     if "f1" in cells:
         energy = " + ".join(f"pow({cells[name]} * {chip.fraction!r}, 2)" for name in ("f1", "f2", "f3"))
         offset = 0.0
@@ -107,4 +107,4 @@ LINES: Final[dict[str, dict[str, Any]]] = {
     "trek-corrected": {"line": f"mc{_REPORT}", "wide": {"range_m": "r{to_id}"}, "units": {"distance": "mm"}},
     "trek-raw": {"line": f"mr{_REPORT}", "wide": {"range_m": "r{to_id}"}, "units": {"distance": "mm"}},
 }
-"""Keys of a map by the name of a form; the first that matches is taken, so longer ones come first."""
+"""Keys of a map by the name of a form; the first match is used, so longer forms are first."""

@@ -1,10 +1,10 @@
 """Tables of exchanges, of messages or of plain ranges, one file or several, written to a recording.
 
-The steps: stage the tables, combine the rows of each exchange and record unusable rows as faults (`staging`), find out
-how stamps are to be read (`plausibility`), write the exchanges in blocks. A table is refused if half of its rows or
-more are unusable. `range_m` is the range that the device reported, or else the range by the stamps. `gt_range_m`, or
-the distance between the two antenna positions (`from_x_m` ... `to_z_m`), is stored as the true distance of the
-exchange; antennas with positions become bodies with poses.
+The steps: stage the tables, combine the rows of each exchange and record unusable rows as faults (`staging`), determine
+the meaning of stamps (`plausibility`), write the exchanges in blocks. A table is refused if half of its rows or more
+are unusable. `range_m` is the range reported by the device, or else the range by the stamps. `gt_range_m`, or the
+distance between the two antenna positions (`from_x_m` ... `to_z_m`), is stored as the true distance of the exchange;
+antennas with positions become bodies with poses.
 """
 
 from __future__ import annotations
@@ -70,12 +70,12 @@ _BESIDE: Final = {
     "powers": {"rxp1": "rxp1_dbm", "rxp2": "rxp2_dbm"},
     "quality": {"sts1": "sts1", "sts2": "sts2"},
 }
-"""Tables with a row an exchange, and their columns by those of maps."""
+"""Tables with one row per exchange, and their columns by columns of maps."""
 
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """What was imported: the number of rows by table, exchanges first, and notes for the user."""
+    """Result of an import: the number of rows by table, exchanges first, and notes for the user."""
 
     counts: dict[str, int]
     notes: list[str]
@@ -94,7 +94,7 @@ def find_tables(sources: Sequence[Path], map_file: Path | None, _folder: Path) -
 def tables_in(folder: Path, column_map: ColumnMap) -> list[Path]:
     """Return the files of a folder that are tables or logs by their names, in order; raises `ImportTableError`.
 
-    A template of names (`from_name`) chooses those that match it, in folders within, too.
+    A template of names (`from_name`) selects matching files, also in subfolders.
     """
     name = Template(column_map.from_name) if column_map.from_name else None
     suffixes = TABLE_SUFFIXES + ((".txt", ".log", ".dat", ".txt.gz", ".log.gz") if column_map.line else ())
@@ -115,7 +115,7 @@ def import_tables(
     *,
     force: bool = False,
 ) -> Imported:
-    """Write the exchanges of tables to a recording, whose `meta` is added to.
+    """Write the exchanges of tables to a recording, and add to its `meta`.
 
     Raises `ImportTableError`, and what `Recording.create` raises.
     """
@@ -131,7 +131,7 @@ def import_tables(
         meta = {**meta, "timestamp_bits": reading.bits if reading else 32, **meta_of_delays(delays)}
         meta |= {"tag_names": names} if names else {}
         meta |= {"chip": column_map.chip} if column_map.chip else {}
-        if rows.has("difference_m") and not delays:  # without stamps: what was programmed is not in them
+        if rows.has("difference_m") and not delays:  # without stamps: programmed delays are not in them
             meta = {key: value for key, value in standard_meta().items() if key != ALL} | meta
         with Recording.create(output, meta=meta, force=force, memory_mb=250) as recording:
             ids = [name for name in ALL_IDS if rows.has(name)]
@@ -152,7 +152,7 @@ def import_tables(
                     raw, reported = raw_range(exchanges), exchanges.range_m
                     exchanges = replace(exchanges, range_m=np.where(np.isfinite(reported), reported, raw))
                 recording.append_exchanges(exchanges)
-                for table, beside in _beside(exchanges, block):
+                for table, beside in _other_rows(exchanges, block):
                     recording.append(table, beside)
             for poses in _poses(rows, bodies):
                 recording.append_poses(poses)
@@ -173,8 +173,8 @@ def import_tables(
         return Imported({name: n for name, n in counts.items() if n or name == "exchanges"}, notes)
 
 
-def _beside(exchanges: Exchanges, block: Columns) -> Iterator[tuple[str, Columns]]:
-    """Yield what rows say beside exchanges, by table of the recording."""
+def _other_rows(exchanges: Exchanges, block: Columns) -> Iterator[tuple[str, Columns]]:
+    """Yield the other contents of rows, by table of the recording."""
     for table, columns in _BESIDE.items():
         if columns.keys() & block.keys():
             ends = {name: getattr(exchanges, name) for name in ("time_ns", "initiator", "target")}
@@ -189,7 +189,7 @@ def _beside(exchanges: Exchanges, block: Columns) -> Iterator[tuple[str, Columns
 def _notes(staging: Staging) -> list[str]:
     notes, names = [], staging.names
     if names:
-        # The first dozen; a recording has all, as its tags' bodies.
+        # The first dozen; the recording has all, as bodies of its tags.
         some = first_few((f"{name[:20]} = {number}" for number, name in names.items()), 12)
         notes.append(f"{len(names)} ids are words or too large, and were numbered: {some}")
     if staging.blanks:
@@ -203,13 +203,13 @@ def _notes(staging: Staging) -> list[str]:
 
 
 def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) -> tuple[StagedRows, Reading | None]:
-    """Return the usable exchanges and how to read their stamps, None for ranges without stamps; adds to the notes.
+    """Return the usable exchanges and the reading of their stamps, None for ranges without stamps; adds to the notes.
 
     Raises `ImportTableError` if half of the rows or more are unusable.
     """
     column_map, path = staging.column_map, staging.paths[0]
     if (back := rows_back(staging.rows))[0]:
-        # Rows of one log are out of order by less; each of several files begins anew.
+        # Rows of one log are out of order by less; each of several files restarts the time.
         more = (
             f"; times go back by up to {back[1]:.1f} s: if the clock was set back, or the table contains several "
             f"recordings, import the parts separately"
@@ -286,7 +286,7 @@ def _poses(rows: StagedRows, bodies: Mapping[int, str]) -> Iterator[Poses]:
         f"{', '.join(f'{end}_{axis}_m AS {axis}' for axis in 'xyz')} FROM located"
         for rank, (end, name) in enumerate(zip(("from", "to"), IDS, strict=True))
     )
-    # The first of several positions at one time counts; initiators come before targets.
+    # The first of several positions at one time is used; initiators are before targets.
     one = ", ".join(f"arg_min({axis}, (rank, row)) AS {axis}" for axis in "xyz")
     moves = " OR ".join(f"min({axis}) OVER tags <> max({axis}) OVER tags" for axis in "xyz")
     rows.db.execute(
@@ -303,10 +303,11 @@ def _poses(rows: StagedRows, bodies: Mapping[int, str]) -> Iterator[Poses]:
 
 
 def _without_repeats(rows: StagedRows) -> tuple[StagedRows, str]:
-    """Return ranges without stamps less those that the other device of an exchange logged, too, and a note on repeats.
+    """Return ranges without stamps, without those that the other device of an exchange also logged, and a note on
+    repeats.
 
-    A range may equal the previous one of the same two devices by chance, or because it repeats it. In the first case
-    the times since the previous range are those of other ranges; a repetition follows sooner.
+    A range may equal the previous one of the same two devices by chance, or as a repetition. By chance, the time since
+    the previous range is as usual; a repetition follows sooner.
     """
     if not rows.has("time_s"):
         return rows, ""
@@ -323,12 +324,12 @@ def _without_repeats(rows: StagedRows) -> tuple[StagedRows, str]:
     ).fetchall()
     if count < MIN_ROWS or after >= others / 2:
         return rows, ""
-    said = f"of {rows.count()} ranges repeat the one before of the same two devices, {after:.3g} ms after it"
+    text = f"of {rows.count()} ranges repeat the one before of the same two devices, {after:.3g} ms after it"
     if 2 * turned < count:
-        return rows, f"{count} {said}, others follow after {others:.3g} ms: some may be logged twice; all are kept"
+        return rows, f"{count} {text}, others follow after {others:.3g} ms: some may be logged twice; all are kept"
     rows.db.execute(
         f"CREATE TABLE repeats AS SELECT row FROM ({gaps}) WHERE equal AND turned AND gap_ms < {others / 2!r}"
     )
     (merged,) = StagedRows(rows.db, "repeats", ()).values("count(*)")
     kept = rows.where("rowid NOT IN (SELECT row FROM repeats)")
-    return kept, f"{merged} {said}, as logged by the other device, and are left out"
+    return kept, f"{merged} {text}, as logged by the other device, and are left out"

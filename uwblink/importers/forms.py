@@ -1,6 +1,6 @@
 """Recognise forms and units for `uwblink import guess`: logs, tables without a header, wide ones, names of files.
 
-Names of columns are those that labs write, English and German; `PATTERNS` says which of `NAMES` they are.
+Names of columns are English and German, as in files of laboratories; `PATTERNS` maps them to `NAMES`.
 """
 
 from __future__ import annotations
@@ -63,13 +63,13 @@ WORDS: Final = {
     "from": r"(from|src|source|initiator|tag|my|sender|tx|requester|robot|rover|mobile|node_?a|id_?1)",
     "to": r"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|beacon|node_?b|id_?2)",
 }
-"""Words that patterns are made of."""
+"""Words in patterns."""
 
 
 def _place(name: str) -> str:
     """Return the pattern of a column of `POSITIONS`, for names such as `tag_x`, `anchor_pos_x_m`, `x_tag` and `x1`.
 
-    A plain `x` is the initiator's, since the initiator moves if the other devices are called anchors.
+    A plain `x` belongs to the initiator, which is the moving device if the others are called anchors.
     """
     end, axis = name.split("_")[:2]
     words, number = WORDS[end], 1 if end == "from" else 2
@@ -127,7 +127,7 @@ _OF_DIFFERENCES: Final = PATTERNS | {
     "from_id": r"((anchor|anker|node)_?)?(from|minus|src|source){id}",
     "to_id": r"((anchor|anker|node)_?)?(to|plus|dst|target){id}",
 }
-"""Patterns of names in tables of differences of arrival, whose ids have other roles than those of ranges."""
+"""Patterns of names in tables of differences of arrival, whose ids have other roles than ids of ranges."""
 
 _OF_MESSAGE: Final = {"poll": 1, "resp": 2, "response": 2}
 _AT_DEVICE: Final = {"resp": 1, "responder": 1, "target": 1, "anchor": 1, "init": 2, "initiator": 2, "tag": 2}
@@ -162,7 +162,7 @@ def named_columns(headers: Iterable[str]) -> dict[str, str]:
     differ = re.search(WORDS["difference"], words) is not None
     for ours, pattern in (_OF_DIFFERENCES if differ else PATTERNS).items():
         whole = f"({pattern}){{end}}".format_map(WORDS)
-        # Each column is used once, but for names of messages, which may repeat those of exchanges at this stage.
+        # Each column is used once, except names of messages, which may repeat names of exchanges at this stage.
         taken = {header for name, header in found.items() if (name in OF_MESSAGES) == (ours in OF_MESSAGES)}
         free = (header for header in listed if listed.count(header) == 1 and header not in taken)
         if header := next((header for header in free if re.fullmatch(whole, called[header])), None):
@@ -187,7 +187,7 @@ Entries = dict[str, tuple[Any, str]]
 
 
 def form_of(path: Path) -> tuple[ColumnMap, Entries]:
-    """Return what a map has to state so that a file is read as a table, and its entries with their reasons."""
+    """Return the entries of a map that are needed to read a file as a table, with their reasons."""
     if path.name.lower().removesuffix(".gz").endswith((".parquet", ".jsonl", ".ndjson", ".json")):
         return ColumnMap(), {}
     return _log(path) or (ColumnMap(headerless=lacks_header(detect(path, ColumnMap())[0])), {})
@@ -198,7 +198,7 @@ def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
     with reading(path), open_file(path) as file:
         # The time of a search grows with the square of a line's length; no board prints 10,000 letters in one.
         lines = [line[:10_000].decode("latin-1").rstrip("\r\n") for line in islice(file, 400)]
-    # Boards begin to print at different times, and in the middle of lines.
+    # Boards start to print at different times, and in the middle of lines.
     if 5 * sum(map(bool, map(object_in, lines))) > sum(map(bool, lines)):
         return ColumnMap(line=JSON_LINE), {"line": (JSON_LINE, "lines that end with an object of JSON")}
     found: dict[str, list[re.Match[str]]] = {}
@@ -239,7 +239,7 @@ def wide_columns(names: Sequence[str], taken: Mapping[str, str]) -> dict[str, st
     for before, after in dict.fromkeys(stem for stem in stems if stems.count(stem) > 1):
         plain = plain_name(f"{before} {after}")
         bare = re.sub(device, "", plain)
-        # Without words of devices nothing but a unit may remain.
+        # Without words for devices only a unit may remain.
         short = r"|(r|d|dis|dis_arr(ay)?|data|ranges|distances|dists)" + ("|" if bare != plain else "")
         for ours in ("range_m", "gt_range_m", "fpp2", "rxp2", "skew2"):
             pattern = f"_?({PATTERNS[ours]}{short if ours == 'range_m' else ''}){{end}}".format_map(WORDS)
@@ -250,7 +250,7 @@ def wide_columns(names: Sequence[str], taken: Mapping[str, str]) -> dict[str, st
 
 
 def register_columns(names: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Return the powers that can be made of registers, as their values in a map, by "fpp" and "rxp"."""
+    """Return the powers that can be computed from registers, as values of a map, by "fpp" and "rxp"."""
     called = {f"f{k}": rf"fp_?ampl?(itude)?_?{k}|f{k}" for k in (1, 2, 3)} | {
         "n": r"rx_?pacc(_?nosat)?|preamble_?(acc(um)?_?)?count|acc(um)?_?count",
         "c": r"cir_?(pwr|power)",
@@ -273,7 +273,7 @@ _VALUES: Final = {
     "gt_range_{}": r"(?<![0-9.])(?P<v>[0-9]+(?:\.[0-9]+)?)_?(?P<unit>mm|cm|m)(?![a-z])",
     "gt_range": r"(?i:(?<![a-z])(?:dist(?:ance)?|gt|true|truth|range)[_\- ]?)(?P<v>[0-9]+(?:\.[0-9]+)?)",
 }
-"""What names of files say, by place; a true distance with or without its unit."""
+"""Patterns of values in names of files, by place; a true distance with or without its unit."""
 
 
 def name_template(name: str, lacking: Collection[str]) -> str | None:
@@ -315,7 +315,7 @@ def units_of(form: ColumnMap, columns: dict[str, str], cells: dict[str, Floats])
 
 
 def _header(form: ColumnMap, name: str, header: str) -> str:
-    """Return the name of a column in the file; that of a family is its template."""
+    """Return the name of a column in the file; for a family its template."""
     stated = form.wide.get(name)
     return re.sub(r"[_ ]*\{\w+\}", "", stated) if isinstance(stated, str) else header
 

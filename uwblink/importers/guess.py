@@ -4,9 +4,9 @@ The form of the file is recognised first (`forms`), then its columns by their na
 are determined from suffixes of the names, from the size of the numbers, and by which unit of the stamps makes plausible
 ranges; the protocol is found by trying all.
 
-Topics of a bag of one message type that differ by one or two numbers or words, such as `/uwb/1/range_2` and
-`/uwb/1/range_3`, are a template; what differs is the id of an initiator or a target. Which it is, the words before it
-tell, and which of both the messages have themselves. Their first messages are a table.
+Topics of a bag with one message type that differ by one or two numbers or words, such as `/uwb/1/range_2` and
+`/uwb/1/range_3`, are a template; the different part is the id of an initiator or a target. The words before it, and the
+ids in the messages themselves, determine which of both. The first messages are read as a table.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def with_stamp_and_event(table: SourceTable, columns: dict[str, str]) -> dict[st
 
 
 def _is_event(table: SourceTable, name: str) -> bool:
-    """Return whether a column has words for transmission and reception, about equally often."""
+    """Return whether a column has words for transmission and for reception, about equally often."""
     word = f"lower(trim({table.text(name)}))"
     sent = f"{word} IN ('tx', 't', 'sent', 'send', 'transmit', 'transmitted')"
     received = f"{word} IN ('rx', 'r', 'received', 'receive', 'recv')"
@@ -114,9 +114,9 @@ def _is_event(table: SourceTable, name: str) -> bool:
 
 
 def _receptions(short: Mapping[str, str], each: str, found: Mapping[str, str]) -> dict[str, str]:
-    """Return further columns of broadcasts whose senders list what they heard before; none for other tables.
+    """Return further columns of broadcasts whose senders list earlier receptions; none for other tables.
 
-    `short` are the columns by their names, those of the elements of the list `each` by their own.
+    `short` are the columns by their names, for elements of the list `each` by the names of their fields.
     """
     if found.get("tx", f"{each}.").startswith(f"{each}."):
         return {}
@@ -151,14 +151,14 @@ _LAYOUTS: Final = {
     ),
     "nothing": ((), OF_MESSAGES, "neither stamps nor ranges were recognised: name their columns below"),
 }
-"""The layouts that are recognised: the columns that each needs, those that it does not have, and the reason."""
+"""The layouts that are recognised: required columns, excluded columns, and the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class Guess:
     """A map as TOML text with reasons as comments, and whether it is sufficient to import the table.
 
-    `asked` are keys that cannot be determined from the table: the map has "?" there, which the user must replace.
+    `asked` are keys that the table does not determine: the map has "?" there, which the user must replace.
     """
 
     text: str
@@ -176,23 +176,23 @@ def guess_map(path: Path) -> Guess:
     if path.suffix.lower() == ".uwb":
         raise ImportTableError(f"{path}: is a recording already and needs no map; 'uwblink show' prints its contents")
     file = tables_in(path, ColumnMap(line="{*}"))[0] if path.is_dir() and not is_bag(path) else path
-    return _of_bag(path) if is_bag(path) else _of_table(path, file)
+    return _map_of_bag(path) if is_bag(path) else _map_of_table(path, file)
 
 
-def _of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Mapping[str, str] = {}) -> Guess:
-    """Return the map of a table as `path` or a part of it is called.
+def _map_of_table(path: Path, file: Path, given: Collection[str] = (), meanings: Mapping[str, str] = {}) -> Guess:
+    """Return the map of a table by its name, `path` or a part of it.
 
-    `given` are columns that have our names, `meanings` recognisable names of columns.
+    `given` are columns with names of `NAMES`, `meanings` recognisable names of columns.
     """
     require_regular(file, ImportTableError, "table")
     with connected([file]) as db:
-        return _of_connected(db, path, file, given, meanings)
+        return _map_of_connected_table(db, path, file, given, meanings)
 
 
-def _of_connected(
+def _map_of_connected_table(
     db: duckdb.DuckDBPyConnection, path: Path, file: Path, given: Collection[str], meanings: Mapping[str, str]
 ) -> Guess:
-    """Return the map of a table, which is opened again in each form that its columns show it to have."""
+    """Return the map of a table, which is opened again in each form that its columns indicate."""
     form, top = form_of(file)
     table = SourceTable(db, file, form)
     if form.headerless:
@@ -206,7 +206,7 @@ def _of_connected(
     given |= {"to_id", *wide, *(["from_id"] if "{from_id}" in str(wide) else [])} if wide else set()
     form = replace(form, wide=wide, each=form.each or each, units=form.units | ({"time": "ns"} if is_bag(path) else {}))
     table = SourceTable(db, file, form, 1)
-    # Fields of the elements of a list are called by their own names.
+    # Fields of the elements of a list have their own names.
     short = {name.removeprefix(f"{form.each}."): name for name in table.names}
     short |= {meaning: name for name, meaning in meanings.items() if name in short}
     found = with_stamp_and_event(table, {ours: short[name] for ours, name in named_columns(short).items()})
@@ -237,7 +237,7 @@ def _of_connected(
 
 
 def _numbered(path: Path, table: SourceTable) -> Guess:
-    """Return the map of a table without a header, whose columns the user has to number."""
+    """Return the map of a table without a header; the user has to number its columns."""
     first = ", ".join(f"{k} = {word[:20]}" for k, word in table.words_at(table.names, [0])[0].items())
     wanted = ("time_s", *IDS, "range_m")
     why = "write the number of the column, or delete the line; constants are for what the table lacks"
@@ -268,7 +268,7 @@ def _proposal(
     layout = "stamps" if "event" in columns else next(known)
     needed, foreign, why = _LAYOUTS[layout]
     if layout == "messages" and "message" in words and columns["message"] != "message":
-        del columns["message"], cells["message"]  # without a column of that name messages are told by their order
+        del columns["message"], cells["message"]  # without a column of that name the order of messages is used
     top |= {} if layout == "nothing" else {"layout": (layout, why)}
     units, undelayed = units_of(form, columns, cells), False
     if layout not in ("ranges", "differences", "nothing"):
@@ -307,7 +307,7 @@ def _proposal(
     named: Entries = {
         name: (header, "") for name, header in columns.items() if name not in foreign and name not in given
     }
-    if layout == "ranges" and "range_m" in named and (others := _alike(columns["range_m"], names)):
+    if layout == "ranges" and "range_m" in named and (others := _kinds_of_range(columns["range_m"], names)):
         named["range_m"] = (
             ASKED,
             f"write the column that the device measured: {' or '.join(json.dumps(one) for one in others)}",
@@ -336,8 +336,8 @@ def _text(path: Path, sections: Mapping[str, Entries], remarks: Iterable[str]) -
     return "\n".join([*lines, "", *(f"# {text}" for text in remarks), ""])
 
 
-def _alike(header: str, names: Sequence[str]) -> list[str]:
-    """Return the columns of ranges that differ by how they were made, such as raw and filtered, if several do."""
+def _kinds_of_range(header: str, names: Sequence[str]) -> list[str]:
+    """Return the columns of ranges of different kinds, such as raw and filtered, if there are several."""
     made = re.compile(rf"(^|_){WORDS['made']}(?=_|$)")
     bare = {name: made.sub("", plain_name(name)).strip("_") for name in names}
     found = [name for name in names if bare[name] == bare[header]]
@@ -361,12 +361,12 @@ _ANY_UNIT: Final = f"unit unknown: write {', '.join(STAMP_UNITS)}"
 
 
 def _message_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> StampEntries:
-    """Return how to read the stamps of a table of messages or of single stamps."""
+    """Return the reading of stamps of a table of messages or of single stamps."""
     stamps: dict[str, Floats] = {name: cells[name] for name in ("tx", "rx", "stamp") if name in cells}
     named = next(iter(units_in(columns, stamps, STAMP_UNITS)), None)
     bits, kind = counter_format(column * STAMP_UNITS[named or "ticks"] for column in stamps.values())
     largest = max(float(np.nanmax(column, initial=0.0)) for column in stamps.values())
-    # Of 22 stamps in ticks one at least is in the last tenth of the counter in nine tables of ten.
+    # In nine tables of ten with 22 stamps in ticks, at least one stamp is in the last tenth of the counter.
     full = _are_whole(stamps) and 0.9 * 2.0**bits < largest < 2.0**bits
     counter: Entries = {"bits": (bits, ""), "counter": (kind, "")}
     unit = ("ticks", f"whole numbers up to 2^{bits}") if full else (ASKED, _ANY_UNIT)
@@ -374,7 +374,7 @@ def _message_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> StampE
 
 
 def _exchange_stamps(columns: dict[str, str], cells: dict[str, Floats]) -> StampEntries:
-    """Return how to read the stamps of a table of exchanges: by which protocol and unit their ranges are plausible."""
+    """Return the reading of stamps of a table of exchanges: the protocol and unit with plausible ranges."""
     stamps: dict[str, Floats] = {name: cells[name] for name in STAMPS if name in cells}
     whole, named = _are_whole(stamps), units_in(columns, stamps, STAMP_UNITS)
     chosen = np.flatnonzero(np.all([np.isfinite(column) for column in stamps.values()], axis=0))[:SAMPLE_ROWS]
@@ -420,7 +420,7 @@ _OTHERS: Final = (
     rf"^{_NUMBERS} (?!.*(uwb|rang(e|ing)|dist|dwm?[0-9]|twr))|"
     r" .*(height|altitude|lidar|laser|sonar|sonic|infrared|rangefinder|distance_sensor)"
 )
-"""Types and topics, with a blank between, that are of other things, and of numbers that are not called ranges."""
+"""Types and topics, with a blank between, of other data, and of numbers that are not named as ranges."""
 
 _WORD: Final = "([^/_]+)"
 _WORDS: Final = {
@@ -429,8 +429,8 @@ _WORDS: Final = {
 }
 
 
-def _of_bag(path: Path) -> Guess:
-    """Return the map of the topics of which most is recognised: stamps and powers, then ids.
+def _map_of_bag(path: Path) -> Guess:
+    """Return the map of the topics with the most recognised columns: stamps and powers, then ids.
 
     Raises `ImportTableError` for a bag without ranges.
     """
@@ -445,7 +445,7 @@ def _of_bag(path: Path) -> Guess:
                     guess = _guess_topics(bag, pattern, some, Path(folder) / "messages.jsonl")
                     found += [(guess, some)] if guess.complete else []
                 except ImportTableError as error:
-                    # Most topics are of something else; only a type without definition may hide ranges.
+                    # Most topics have other data; only a type without definition may contain ranges.
                     why = str(error) if "has no definition" in str(error) else why
     listed = [f"{json.dumps(topic)} ({kind})" for topic, kind in kinds.items()]
     if not found:
@@ -480,12 +480,12 @@ def _guess_topics(bag: Bag, pattern: str, topics: list[str], table: Path) -> Gue
     whole = name_template(topics[0], set(free) - ids[topics[0]].keys()) or topics[0]
     constants = matching_topics(whole, topics[:1]).get(topics[0], {})
     ids = {topic: {**places, **constants} for topic, places in ids.items()}
-    # A template that also matches topics of other types is no key.
+    # A template that also matches topics of other types is not usable as a key.
     stated = {key: constants} if len(matching_topics(key, bag.kinds)) == len(topics) else ids
     with raising(ImportTableError, f"{bag.path}: cannot be turned into a table", OSError, RecursionError):
         lines = (json.dumps(_unstamped(row) | ids[topic], allow_nan=False) for topic, row in rows)
         table.write_text("".join(f"{line}\n" for line in lines), "utf-8")
-    guess = _of_table(bag.path, table, ids[topics[0]], {"data": "range"} if re.fullmatch(_NUMBERS, kind) else {})
+    guess = _map_of_table(bag.path, table, ids[topics[0]], {"data": "range"} if re.fullmatch(_NUMBERS, kind) else {})
     sections = [
         "\n".join([f"[topics.{json.dumps(topic)}]", *(f"{name} = {json.dumps(v)}" for name, v in values.items()), ""])
         for topic, values in stated.items()
@@ -494,13 +494,15 @@ def _guess_topics(bag: Bag, pattern: str, topics: list[str], table: Path) -> Gue
 
 
 def _unstamped(row: dict[str, Any]) -> dict[str, Any]:
-    """Return a message without the stamp of its header, which is its time without a map."""
+    """Return a message without the stamp of its header, which is the default time."""
     header = row.get("header")
     return row | {"header": {**header, "stamp": {}}} if isinstance(header, dict) else row
 
 
 def _grouped(topics: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
-    """Yield topics that differ by one or two numbers, or else words, and a format of their names; then the others."""
+    """Yield groups of topics that differ by one or two numbers, or else words, with a format of their names; then the
+    others.
+    """
     braces, left = ([topic for topic in topics if ("{" in topic) == has] for has in (True, False))
     for value in (r"([0-9]+)", _WORD):
         alike: dict[tuple[str, ...], list[str]] = {}
@@ -510,7 +512,7 @@ def _grouped(topics: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
             columns = [set(column) for column in zip(*(re.findall(value, topic) for topic in some), strict=True)]
             varying = [k for k, column in enumerate(columns) if len(column) > 1]
             both, words = [columns[k] for k in varying], {re.split("[^A-Za-z]", literals[k])[-1] for k in varying}
-            # Number 1 of a tag is not number 1 of an anchor; among pairs of words some have a word in common.
+            # Number 1 of a tag is not number 1 of an anchor; in pairs of words, some have a common word.
             mixed = len(words) > 1 and both[0] & both[-1]
             apart = len(both) == 2 and value == _WORD and all(len(column) == len(some) for column in both)
             if not 1 <= len(varying) <= 2 or mixed or apart:
@@ -524,7 +526,7 @@ def _grouped(topics: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
 
 
 def _ends_without_field(row: Mapping[str, Any]) -> list[str]:
-    """Return which of the two ids a message does not have itself; lists and arrays have a target in each element."""
+    """Return which of the two ids a message lacks; lists and arrays have a target in each element."""
     lists = [value for value in row.values() if isinstance(value, list)]
     elements = [one for value in lists for one in value[:1] if isinstance(one, dict)]
     named = {*named_columns(row), *(name for one in elements for name in named_columns(one))}

@@ -1,9 +1,9 @@
-"""Import of flights of the MILUV dataset in the form in which its authors publish them.
+"""Import of flights of the MILUV dataset as published by its authors.
 
-A folder holds one folder a robot with `uwb_range.csv`, and optionally `uwb_passive.csv`, `uwb_cir.csv`, `mocap.csv`,
-`imu_px4.csv` and `height.csv`, and beside those `timeshift.yaml`, `tags.yaml` (lever arms) and `anchors.yaml`
-(constellations). Stamps are those before the authors' correction (`tx1_raw` ...): unwrapped nanoseconds, which become
-ticks again. All files of a folder have one clock; `timeshift.yaml` has its start.
+A folder contains one folder per robot with `uwb_range.csv`, and optionally `uwb_passive.csv`, `uwb_cir.csv`,
+`mocap.csv`, `imu_px4.csv` and `height.csv`, and beside those `timeshift.yaml`, `tags.yaml` (lever arms) and
+`anchors.yaml` (constellations). Stamps are those before the authors' correction (`tx1_raw` ...): unwrapped nanoseconds,
+which become ticks again. All files of a folder have the same clock; `timeshift.yaml` has its start.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ class FlightFolder:
 
 
 def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
-    """Return the flight in `folder`; rows that are in the files of two robots are imported once.
+    """Return the flight in `folder`; rows in the files of two robots are imported once.
 
     `map_file` may name the constellation of anchors.yaml (`constellation = "0"`); by default it is the one whose
-    distances agree with `gt_range`. `meta["notes"]` lists what was left out. Raises `ImportTableError`.
+    distances agree with `gt_range`. `meta["notes"]` lists omitted data. Raises `ImportTableError`.
     """
     wanted = _constellation(map_file)
     if not folder.is_dir():
@@ -132,8 +132,8 @@ def _read(
     """Return the rows of all robots' files of one name in order of time; an empty dictionary if there are none.
 
     `needed` and `optional` map names of columns to those of the files; `{raw}` is replaced by `_raw` if a file has such
-    columns. `by_clock` are those that are stamps. Duplicates of rows with ids are dropped; rows without ids belong to
-    the robot's body. Rows that lack a number that is not optional are faults.
+    columns. `by_clock` are the columns of stamps. Duplicates of rows with ids are dropped; rows without ids belong to
+    the robot's body. Rows that lack a required number are faults.
     """
     parts: list[Columns] = []
     ids = [n for n in needed if n in _IDS]
@@ -257,7 +257,7 @@ def _find_anchors(
         off = np.abs(true_m - measured_m)[np.isin(ends[0], list(places)) | np.isin(ends[1], list(places))]
         off = off[np.isfinite(off)]
         found.append((float(np.median(off)) if len(off) else float("nan"), name, places))
-    # The constellations of the dataset are a decimetre and more apart.
+    # The constellations of the dataset differ by a decimetre or more.
     chosen = [one for one in found if one[1] == wanted or (wanted is None and one[0] < 0.05)]
     if not chosen:
         raise ImportTableError(

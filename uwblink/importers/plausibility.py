@@ -1,9 +1,9 @@
 """Determine the meaning of numbers in a table: units of lengths and powers, format and protocol of stamps.
 
 Stamps have any unit and are wrapped, signed or unwrapped; they become ticks of one counter. A range is plausible
-between -2 m (antenna delays) and 2 km, extended for single-sided ranging by the error of clocks 50 ppm apart over the
-reply, and within 50 m of the measured distance, if there is one. The effect of missing antenna delays is subtracted
-before: 154 m if none were programmed.
+between -2 m (antenna delays) and 2 km, and within 50 m of the measured distance, if there is one. For single-sided
+ranging the limits are extended by the error of clocks 50 ppm apart over the reply. The effect of missing antenna delays
+is subtracted first: 154 m if none were programmed.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from uwblink.ticks import ANTENNA_DELAY_TICKS, METRES_PER_TICK, SPEED_OF_LIGHT, 
 from uwblink.twr import STAMPS, Exchanges, intervals, raw_range
 
 MIN_ROWS: Final = 20
-"""Fewer rows can agree with any assumption by chance."""
+"""Minimum number of rows: fewer rows can agree with any assumption by chance."""
 
 SAMPLE_ROWS: Final = 2000
-"""Number of rows on which readings are tried."""
+"""Number of rows for trials of readings."""
 
 ACCEPTED_SHARE: Final = 0.5
-"""From this share of plausible ranges on, a reading is accepted without trying others."""
+"""Share of plausible ranges from which a reading is accepted without trying others."""
 
 FITTING_SHARE: Final = 0.9
-"""From this share of plausible ranges on, another reading fits."""
+"""Share of plausible ranges from which another reading fits."""
 
 
 def clocks(protocol: str) -> tuple[tuple[str, ...], ...]:
@@ -49,18 +49,18 @@ def clocks(protocol: str) -> tuple[tuple[str, ...], ...]:
 
 
 def stamps_of(protocol: str) -> tuple[str, ...]:
-    """Return the names of the stamps that an exchange of a protocol has."""
+    """Return the names of the stamps of an exchange of a protocol."""
     return STAMPS[: 2 * len(PROTOCOLS[protocol].messages)]
 
 
 def to_ticks(
     cells: Mapping[str, NDArray[Any]], by_clock: Iterable[tuple[str, ...]], ticks_per_unit: float, bits: int
 ) -> dict[str, Ints]:
-    """Return stamps in any unit as ticks of a counter of `bits` bits; missing ones become any number.
+    """Return stamps in any unit as ticks of a counter of `bits` bits; values of missing stamps are arbitrary.
 
     Stamps in other units were scaled and written as floats, with an error that grows with the length of the record;
-    differences of stamps of one clock are accurate. So the first stamp of each clock is rounded, and the difference of
-    each other one from it.
+    differences of stamps of one clock are accurate. So the first stamp of each clock is rounded, and the differences of
+    the others from it are rounded separately.
     """
 
     def whole(values: NDArray[Any]) -> Ints:
@@ -81,8 +81,8 @@ def counter_format(
 ) -> tuple[int, str]:
     """Return the width of a counter in bits and its format ("wrapped", "signed", "unwrapped"), unless they are given.
 
-    The first of 32 and 40 bits is chosen into which 99 % of the stamps fit, wrapped or signed; the others are faults.
-    If none fits, stamps are unwrapped.
+    The width is 32 bits, or else 40 bits, if 99 % of the stamps fit, wrapped or signed; the other stamps are faults. If
+    none fits, stamps are unwrapped.
     """
     stamps = np.concatenate([column[np.isfinite(column)] for column in ticks])
     enough = len(stamps) >= MIN_ROWS
@@ -96,7 +96,7 @@ def counter_format(
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A way to read stamps: protocol, width of the counter, exchanged columns, and missing antenna delays."""
+    """An interpretation of stamps: protocol, width of the counter, exchanged columns, and missing antenna delays."""
 
     protocol: str
     bits: int
@@ -105,7 +105,7 @@ class Reading:
     """Whether no antenna delays were programmed, regardless of the map."""
 
     def difference(self, other: Reading) -> str:
-        """Return the differences from another reading, as a map would state them."""
+        """Return the differences from another reading, as entries of a map."""
         found = [f'protocol = "{self.protocol}"'] if self.protocol != other.protocol else []
         found += [f"bits = {self.bits}"] if self.bits != other.bits else []
         found += [f"the columns of {one} and {two} exchanged" for one, two in self.swapped]
@@ -128,15 +128,15 @@ class Trial:
 
 
 def try_reading(rows: Columns, column_map: ColumnMap, reading: Reading) -> Trial:
-    """Return the result of a reading on a sample of rows, whose ranges are beside true distances if there are any."""
+    """Return the result of a reading on a sample of rows, compared with true distances if there are any."""
     columns = dict(rows)
     for one, two in reading.swapped:
         columns[one], columns[two] = columns[two], columns[one]
     exchanges = exchanges_of(column_map, columns, reading)
-    # Half of both devices' missing delays, of transmission and reception.
+    # Half of the missing delays of both devices, for transmission and reception.
     longer_m = 2 * ANTENNA_DELAY_TICKS * METRES_PER_TICK if reading.undelayed else _longer_m(column_map, rows)
     raw = raw_range(exchanges) - longer_m
-    ranges = np.where(np.isfinite(raw), raw, np.nan)  # no time between the last two messages makes them infinite
+    ranges = np.where(np.isfinite(raw), raw, np.nan)  # they are infinite if the last two messages have the same time
     true = exchanges.truth_m
     spans, half = intervals(exchanges), 2.0 ** (reading.bits - 1)
     single = PROTOCOLS[reading.protocol].third_sender is None
@@ -147,8 +147,8 @@ def try_reading(rows: Columns, column_map: ColumnMap, reading: Reading) -> Trial
         if not single:
             good &= (spans.dt53 < half) & (spans.dt64 < half) & (spans.dt53 > 0)
         good &= ~np.isfinite(true) | (np.abs(ranges - true) < 50.0 + allowance)
-        # With the columns of its stamps exchanged, a third message of the initiator looks like one of the target by a
-        # clock whose rate follows the range: dt64 - dt53 = -(dt41 - dt32).
+        # With exchanged columns of stamps, a third message of the initiator looks like one of the target with a clock
+        # rate that depends on the range: dt64 - dt53 = -(dt41 - dt32).
         there_and_back, apart = spans.dt41 - spans.dt32, spans.dt64 - spans.dt53
         with_third, without = (
             np.subtract(*np.percentile(x, [75, 25])) for x in (there_and_back + apart, there_and_back)
@@ -171,9 +171,10 @@ def _longer_m(column_map: ColumnMap, rows: Columns) -> Floats:
 
 
 def settle_reading(path: Path, column_map: ColumnMap, rows: Columns, reading: Reading) -> tuple[Reading, str]:
-    """Return how to read the stamps, and a note: as the map says, or otherwise if only that makes plausible ranges.
+    """Return the reading of stamps, and a note: the reading of the map, or another one if only that gives plausible
+    ranges.
 
-    Raises `ImportTableError` if that contradicts the map.
+    Raises `ImportTableError` if this contradicts the map.
     """
     first = try_reading(rows, column_map, reading)
     if first.plausible >= ACCEPTED_SHARE or len(rows["origin"]) < MIN_ROWS:
@@ -187,7 +188,7 @@ def settle_reading(path: Path, column_map: ColumnMap, rows: Columns, reading: Re
             f"the ranges are not plausible ({first}), and neither are they with another protocol, width or order of "
             f"the columns; check the map"
         )
-    # The larger share of plausible ranges, then the smaller spread.
+    # Order: the larger share of plausible ranges, then the smaller spread.
     best = min(fitting, key=lambda trial: (-round(trial.plausible, 2), trial.error_m[1] - trial.error_m[0]))
     found, difference = best.reading, best.reading.difference(reading)
     contradicted = (
@@ -227,7 +228,7 @@ def exchanges_of(column_map: ColumnMap, rows: Columns, reading: Reading | None, 
     """Return rows as exchanges with the reported ranges, NaN where there are none; `before` counts earlier rows.
 
     Without a reading the rows are ranges without stamps: single-sided exchanges whose stamps are 0. The total received
-    power serves where there is none of the first path.
+    power is used if there is no first-path power.
     """
     power = "fpp" if "fpp1" in rows or "fpp2" in rows else "rxp"
     count = len(rows["origin"])
@@ -245,7 +246,7 @@ def exchanges_of(column_map: ColumnMap, rows: Columns, reading: Reading | None, 
 
 
 def truth_m(rows: Columns) -> Floats:
-    """Return measured distances (n,), or else those between the antenna positions; NaN if unknown."""
+    """Return measured distances (n,), or else distances between the antenna positions; NaN if unknown."""
     if "gt_range_m" in rows or not all(name in rows for name in POSITIONS):
         return optional(rows, "gt_range_m")
     ends = np.array([rows[name] for name in POSITIONS])
@@ -258,7 +259,7 @@ def optional(rows: Columns, name: str) -> Floats:
 
 
 Errors = Callable[[float], Floats]
-"""Returns ranges less distances (n,) with some lengths multiplied by a factor, in the given unit of the ranges.
+"""Returns ranges minus distances (n,) with some lengths multiplied by a factor, in the given unit of the ranges.
 
 In this unit noise does not depend on the factor; otherwise ranges of boards at rest would seem to be in feet.
 """
@@ -267,10 +268,10 @@ In this unit noise does not depend on the factor; otherwise ranges of boards at 
 def other_unit(errors: Mapping[str, Errors], ranges: str) -> str:
     """Return which lengths are evidently in which other unit, such as "ranges are in mm"; "" if all are in metres.
 
-    `errors` are by the name of the lengths that are multiplied; those called `ranges` may be times of flight. The
-    residuals of the errors from a constant (antenna delays) are compared: a unit is found if they are smaller by more
-    than the square root of its factor. Residuals of distances that are unrelated to the ranges shrink to the spread of
-    the ranges, by at most the square root of two.
+    `errors` are by the name of the multiplied lengths; lengths named `ranges` may be times of flight. The residuals of
+    the errors from a constant (antenna delays) are compared: a unit is found if they are smaller by more than the
+    square root of its factor. Residuals of distances that are unrelated to the ranges shrink to the spread of the
+    ranges, by at most the square root of two.
     """
     best, found = 0.0, ""
     for name, of in errors.items():
@@ -283,7 +284,7 @@ def other_unit(errors: Mapping[str, Errors], ranges: str) -> str:
 
 
 def _remaining(errors_m: Floats) -> float:
-    """Return the median absolute residual of errors from a constant within antenna delays; NaN of few values."""
+    """Return the median absolute residual of errors from a constant within antenna delays; NaN for few values."""
     finite = errors_m[np.isfinite(errors_m)]
     if len(finite) < MIN_ROWS:
         return float("nan")
@@ -292,10 +293,11 @@ def _remaining(errors_m: Floats) -> float:
 
 
 def sentinels(ranges: Floats) -> dict[float, float]:
-    """Return the share of each number that is no range but often stands for none, such as 0, -1 or 65535.
+    """Return the share of each number that probably marks a missing range, such as 0, -1 or 65535.
 
-    It is zero, negative, or five times beyond all others, and exactly the same twice and in 0.1 % of the numbers (n,),
-    which are in the unit of the table; or the largest number of 16 or 32 bits, or -1 as the only negative number.
+    Such a number is zero, negative, or five times larger than all others, and occurs at least twice and in 0.1 % of the
+    numbers (n,), which are in the unit of the table; or it is the largest number of 16 or 32 bits, or -1 as the only
+    negative number.
     """
     finite = ranges[np.isfinite(ranges)]
     values, counts = np.unique(finite, return_counts=True)
@@ -310,12 +312,12 @@ def sentinels(ranges: Floats) -> dict[float, float]:
 
 
 def reason_against_metres(ranges: Floats) -> str:
-    """Return why numbers (n,) cannot be ranges in metres; empty text if they can."""
+    """Return the reason why numbers (n,) cannot be ranges in metres; empty text if they can."""
     finite = ranges[np.isfinite(ranges)]
     middle = float(np.median(np.abs(finite))) if len(finite) >= MIN_ROWS else 0.0
     if middle > 300.0:  # DW1000 devices reach 290 m in the open by their data sheet
         return f"the median range is {middle:.6g}, in metres longer than the reach of the devices"
-    if 0.0 < middle < 1e-6:  # seconds: light travels 300 m in a microsecond
+    if 0.0 < middle < 1e-6:  # times in seconds: light travels 300 m in a microsecond
         return f"the median is {middle:.3g}, impossible in metres"
     # With noise of centimetres, ranges are not all integers, unless one number repeats.
     if len(np.unique(finite)) > MIN_ROWS // 4 and np.array_equal(finite, np.rint(finite)) and middle:
@@ -324,7 +326,9 @@ def reason_against_metres(ranges: Floats) -> str:
 
 
 def reason_against_dbm(powers: Floats, limits: tuple[float, float] = CHIPS["other"].power_dbm) -> str:
-    """Return why numbers (n,) cannot be received powers in dBm within a chip's limits; empty text if they can."""
+    """Return the reason why numbers (n,) cannot be received powers in dBm within a chip's limits; empty text if they
+    can.
+    """
     finite = powers[np.isfinite(powers) & (powers != 0)]  # boards print 0 for an unknown power
     middle, (low, high) = float(np.median(finite)) if len(finite) else limits[0], limits
     return "" if low <= middle <= high else f"the median power is {middle:+.4g}, expected {low:g} to {high:g} dBm"
@@ -333,8 +337,8 @@ def reason_against_dbm(powers: Floats, limits: tuple[float, float] = CHIPS["othe
 def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats | None) -> None:
     """Raise `ImportTableError` if a sample of rows shows that lengths or powers are in another unit.
 
-    Implausible numbers are refused unless the map states their unit; lengths that contradict each other always are.
-    `raw_m` are the ranges by the stamps (n,), if there are any.
+    Implausible numbers are refused unless the map states their unit; lengths that contradict each other are always
+    refused. `raw_m` are the ranges by the stamps (n,), if there are any.
     """
     ranges, true = optional(rows, "range_m"), truth_m(rows)
     reasons, limits = dict[str, tuple[str, str]](), CHIPS[column_map.chip or "other"].power_dbm

@@ -1,10 +1,10 @@
 """Motion-capture poses from text files and from bags of ROS 1, ROS 2 and MCAP (`uwbcal[bags]`), added to recordings.
 
-The own CSV has the columns `time_s` (or `time_ns`), `body`, `x, y, z` (metres) and `qx, qy, qz, qw` (body to world).
-TUM has `time x y z qx qy qz qw` separated by blanks, and EuRoC `time_ns, x, y, z, qw, qx, qy, qz, ...` below a line
-that begins with `#timestamp`, one body a file. Motive (OptiTrack), Vicon and Qualisys (6D) export a column for each
-number of each body, below several lines of header: quaternions or Euler angles; rotation vectors or quaternions; and
-rotation matrices, column by column. Their times begin with the take.
+The project's CSV has the columns `time_s` (or `time_ns`), `body`, `x, y, z` (metres) and `qx, qy, qz, qw` (body to
+world). TUM has `time x y z qx qy qz qw` separated by blanks, and EuRoC `time_ns, x, y, z, qw, qx, qy, qz, ...` below a
+line that begins with `#timestamp`, one body per file. Motive (OptiTrack), Vicon and Qualisys (6D) export a column for
+each number of each body, below several lines of header: quaternions or Euler angles; rotation vectors or quaternions;
+and rotation matrices, column by column. Their times start with the take.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ MESSAGES: Final = {
     "foxglove.PoseInFrame": ("pose.position", "pose.orientation", False),
     "foxglove.FrameTransform": ("translation", "rotation", True),
 }
-"""Message types with poses, in order of preference: the fields of position and attitude, and whether the child frame
-has the name of the body."""
+"""Message types with poses, in order of preference: the fields of position and attitude, and whether the child frame is
+the name of the body."""
 
 DRIVERS: Final = frozenset(
     {
@@ -102,8 +102,8 @@ def _poses(path: Path, time_ns: Ints, body: NDArray[np.str_], values: Floats) ->
 def _from_bag(path: Path, topics: Mapping[str, str] | None) -> Poses:
     """Return the poses of a bag.
 
-    `topics` are the topics to read, by body. By default these are all topics of the first type of `MESSAGES` that the
-    bag has. The name of the body is the topic's without that of the driver, or the child frame of a transform.
+    `topics` are the topics to read, by body. By default these are all topics of the first type of `MESSAGES` in the
+    bag. The name of the body is the name of the topic without the driver's name, or the child frame of a transform.
     """
     times, bodies, values = list[int](), list[str](), array("d")
     with open_bag(path) as bag:
@@ -115,7 +115,7 @@ def _from_bag(path: Path, topics: Mapping[str, str] | None) -> Poses:
                     bodies.append(wanted[topic] or child or _body_in(topic) or topic)
                     values.extend(numbers)
             except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
-                # The content of JSON messages need not agree with the name of their schema.
+                # The content of JSON messages may differ from their schema.
                 raise ImportTableError(f"{path}: a message of {topic[:80]!r} is no {kind}") from error
     return _poses(path, np.array(times, dtype=np.int64), np.array(bodies, np.str_), np.array(values).reshape(-1, 7))
 
@@ -160,9 +160,9 @@ def _of_message(kind: str, message: dict[str, Any]) -> Iterator[tuple[int, str, 
         if abs(time_ns) > LATEST_NS or (is_json and None in numbers):
             raise ValueError
         child = str(one.get("child_frame_id", "")) if has_body else ""
-        # A driver of ROS may give NaN, here None, while it does not see a body.
+        # A ROS driver may give NaN, here None, while a body is not visible.
         known = [math.nan if number is None else float(number) for number in numbers]
-        yield time_ns, _body_in(child), known  # Vicon's frames are called vicon/drone/drone
+        yield time_ns, _body_in(child), known  # Vicon's frames have names such as vicon/drone/drone
 
 
 def _field(message: Any, path: str) -> Any:
@@ -174,7 +174,7 @@ def _field(message: Any, path: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class AddedPoses:
-    """Added poses: their number, bodies and offset, the number of exchanges that they cover; bodies that lack poses."""
+    """Added poses: number, bodies, offset, number of covered exchanges; and bodies without poses."""
 
     poses: int
     bodies: tuple[str, ...]
@@ -197,10 +197,10 @@ def add_poses(
 ) -> AddedPoses:
     """Add poses from a file, or from files by body, to a recording; `offset` is in seconds, or "auto".
 
-    `tags_from` is a file of TOML or JSON with `[[tags]]`, and `[[anchors]]` that stand still. `topics` are those of a
-    bag to read, by body; `body` names that of a file which does not. `map_file` names the columns of CSV files. Raises
-    `RecordingExistsError` where there are poses already, unless `force` replaces them, `ImportTableError` for poses
-    that cannot be used, what `load_places` and `Recording.open` raise; the recording stays as it was then.
+    `tags_from` is a file of TOML or JSON with `[[tags]]`, and `[[anchors]]` that stand still. `topics` are the topics
+    of a bag to read, by body; `body` is the body of a file without names of bodies. `map_file` names the columns of CSV
+    files. Raises `RecordingExistsError` where there are poses already, unless `force` replaces them, `ImportTableError`
+    for unusable poses, and the errors of `load_places` and `Recording.open`; then the recording is unchanged.
     """
     shift_ns = None if offset == "auto" else _offset_ns(offset)
     files = source if isinstance(source, Mapping) else {body: source}
@@ -227,7 +227,7 @@ def add_poses(
         with_poses = [tag for tag in placed if tag.body in bodies]
         ids = [tag.tag for tag in with_poses]
         known = np.isin(first, ids) & np.isin(second, ids)
-        # Places of anchors alone serve robots whose poses nobody knows; poses of a body that carries no tag do not.
+        # Places of anchors alone are useful for robots without poses; poses of bodies without tags are not.
         strange = parts and bodies.isdisjoint(tag.body for tag in placed if tag.tag not in anchors)
         if len(ids) < 2 or strange or not (known.any() or shift_ns is not None):
             found = ", ".join(sorted({tag.body for tag in placed})) or "none"
@@ -282,7 +282,7 @@ def _check_units(what: str, exchanges: Exchanges, poses: Poses, tags: Sequence[T
 
 
 def in_order(parts: list[Poses]) -> Poses:
-    """Join poses in order of time; single poses of bodies that stand still get the first time of the others."""
+    """Join poses in order of time; single poses of standing bodies get the first time of the others."""
     if len(parts) == 1:
         return parts[0]
     first = min((int(part.time_ns.min()) for part in parts if len(part) > 1), default=0)
@@ -308,11 +308,11 @@ Lines = list[list[str]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseLayout:
-    """Where a form has its poses; columns are numbers from 0.
+    """The columns and lines of poses in a form; columns are numbers from 0.
 
-    `bodies` are the columns of position and attitude by body, with the name "" if a column says the body. `header` is
-    the number of lines before the first pose. Poses of programs that lose sight of a body have `gaps`. `euler` is the
-    order of attitudes that are Euler angles about the body's own axes, such as "XYZ".
+    `bodies` are the columns of position and attitude by body, with the name "" if a column has the body. `header` is
+    the number of lines before the first pose. `gaps` tells whether poses may be missing while a body is not visible.
+    `euler` is the order of Euler angles about the body's own axes, such as "XYZ".
     """
 
     form: str
@@ -331,10 +331,10 @@ class PoseLayout:
 
 
 def _from_text(path: Path, file: TextIO, body: str | None, stated: ColumnMap) -> tuple[Poses, bool]:
-    """Return the poses of a text file, and whether it has attitudes; without them no body is turned.
+    """Return the poses of a text file, and whether it has attitudes; without them all bodies have the identity.
 
-    Quaternions need not have length one. `body` names that of a file which does not; `stated` names the columns of a
-    CSV file, and the units of its times and positions. Raises `ImportTableError`.
+    Quaternions need not have length one. `body` is the body of a file without names of bodies; `stated` names the
+    columns of a CSV file, and the units of its times and positions. Raises `ImportTableError`.
     """
     first = file.readline()
     lines = chain([first], file)
@@ -394,7 +394,7 @@ def _quaternions(values: Floats, euler: str) -> Floats:
 
 
 def _iso_ns(text: str) -> str:
-    """Return ISO 8601, UTC without a zone, as nanoseconds; other text as it is."""
+    """Return ISO 8601, UTC without a zone, as nanoseconds; other text unchanged."""
     try:
         moment = datetime.fromisoformat(text.strip())
     except ValueError:
@@ -404,7 +404,7 @@ def _iso_ns(text: str) -> str:
 
 
 def _single(path: Path, body: str | None, *, blanks: bool) -> PoseLayout:
-    """Return the layout of TUM, whose cells have blanks between them, or of EuRoC."""
+    """Return the layout of TUM, with blanks between cells, or of EuRoC."""
     form, unit, quaternion = ("TUM", "s", POSE[3:]) if blanks else ("EuRoC", "ns", ("qw", "qx", "qy", "qz"))
     if not body:
         raise ImportTableError(f"{path}: a {form} file has no names of bodies; give the name with `body`")
@@ -421,7 +421,7 @@ _NAMES: Final = (
     | {axis: rf"(p|pos|t|(.*_)?(position|translation))?_?{axis}(_(?P<unit>m|cm|mm))?" for axis in "xyz"}
     | {f"q{axis}": rf"(q|quat|rot|(.*_)?(quaternion|orientation|rotation))_?{axis}" for axis in "xyzw"}
 )
-"""Names of columns as programs write them, in plain words."""
+"""Plain names of columns, as written by programs."""
 
 
 def _plain(path: Path, head: Lines, body: str | None, stated: ColumnMap) -> PoseLayout:
@@ -468,16 +468,16 @@ def _header(path: Path, head: Lines, *words: str) -> int:
 def _motive(path: Path, head: Lines) -> PoseLayout:
     """Return the layout of Motive's CSV: lines of kinds, names, Rotation or Position, and axes, in any version.
 
-    Euler angles are about the axes as turned so far (NaturalPoint's knowledge base, "Changes in Motive's reported Euler
+    Euler angles are about the rotated axes (NaturalPoint's knowledge base, "Changes in Motive's reported Euler
     angles"), in degrees, in the order that the header names.
     """
-    said = dict(zip(head[0][::2], head[0][1::2], strict=False))
+    header = dict(zip(head[0][::2], head[0][1::2], strict=False))
     units = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
-    unit, rotation = units.get(said.get("Length Units", "Meters").lower()), said.get("Rotation Type", "Quaternion")
+    unit, rotation = units.get(header.get("Length Units", "Meters").lower()), header.get("Rotation Type", "Quaternion")
     euler = rotation if sorted(rotation) == ["X", "Y", "Z"] else ""
     if unit is None or not (euler or rotation == "Quaternion"):
         raise ImportTableError(
-            f"{path}: found {rotation} and {said.get('Length Units')}, export quaternions and metres"
+            f"{path}: found {rotation} and {header.get('Length Units')}, export quaternions and metres"
         )
     types, kinds = _header(path, head, "Rigid Body"), _header(path, head, "Rotation", "Position")
     bodies: dict[str, dict[str, int]] = {}
@@ -515,15 +515,18 @@ def _vicon(path: Path, head: Lines) -> PoseLayout:
 
 def _qualisys(path: Path, head: Lines) -> PoseLayout:
     """Return the layout of Qualisys' 6D TSV: lines of words and values, then a line of columns by body."""
-    said = {cells[0]: cells[1:] for cells in head if len(cells) > 1}
-    names, first = [name.strip() for name in said.get("BODY_NAMES", ()) if name.strip()], _header(path, head, "Rot[0]")
+    header = {cells[0]: cells[1:] for cells in head if len(cells) > 1}
+    names, first = (
+        [name.strip() for name in header.get("BODY_NAMES", ()) if name.strip()],
+        _header(path, head, "Rot[0]"),
+    )
     starts = [k for k, cell in enumerate(head[first]) if cell.strip().endswith("Rot[0]")]
     if len(starts) != len(names):
         raise ImportTableError(f"{path}: has {len(names)} BODY_NAMES and {len(starts)} bodies below: export 6D data")
     # Position, three angles and the residual come before the matrix.
     fields = ("x", "y", "z", *(f"r{k}" for k in range(9)))
     places = [dict(zip(fields, (k - 7, k - 6, k - 5, *range(k, k + 9)), strict=True)) for k in starts]
-    timed, rate = head[first][1:2] == ["Time"], number_in(next(iter(said.get("FREQUENCY", ())), "")) or math.nan
+    timed, rate = head[first][1:2] == ["Time"], number_in(next(iter(header.get("FREQUENCY", ())), "")) or math.nan
     layout = PoseLayout(
         form="Qualisys", names=head[first], time=int(timed), ns=1e9 if timed else 1e9 / rate, bodies={},
         header=first + 1, metres=DISTANCE_UNITS["mm"],

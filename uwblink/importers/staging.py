@@ -2,11 +2,11 @@
 
 The database is temporary and mostly on disk (`tables.connected`), so memory does not grow with the tables.
 
-Rows of one exchange are combined, and unusable rows become faults with file, line and cell. A row is an exchange, or a
-message with the stamps of its sender and its receiver ("messages"), or one of these stamps ("stamps"), or has some of
-the columns of an exchange, for example if both devices report ("parts"). Rows belong to one group if they have the same
-devices and numbers and follow each other within `within_s` of the map. The rows are sorted by these keys, so that each
-group is contiguous. Only DuckDB's sort holds many rows at once.
+Rows of one exchange are combined, and unusable rows are recorded as faults with file, line and cell. A row is an
+exchange, or a message with the stamps of its sender and its receiver ("messages"), or one of these stamps ("stamps"),
+or has some of the columns of an exchange, for example if both devices report ("parts"). Rows belong to one group if
+they have the same devices and numbers and follow each other within `within_s` of the map. The rows are sorted by these
+keys, so that each group is contiguous. Only DuckDB's sort holds many rows at once.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ from uwblink.ticks import TICK_S
 from uwblink.twr import LARGEST_ID, STAMPS
 
 ROWS_PER_BLOCK: Final = 245_760
-"""Two row groups of DuckDB: smaller blocks would remain separate row groups in a recording."""
+"""Size of a block, two row groups of DuckDB: smaller blocks would remain separate row groups in a recording."""
 
 Watch = Callable[[str, float], object]
-"""Callback for progress: the current step ("reading", "writing" ...) and the share of it that is done."""
+"""Callback for progress: the current step ("reading", "writing" ...) and its completed share."""
 
 
 def unwatched(_step: str, _share: float) -> None:
@@ -75,7 +75,7 @@ class StagedRows:
     condition: str = "true"
 
     def where(self, condition: str) -> StagedRows:
-        """Return the rows for which this condition is true, too."""
+        """Return the rows for which this condition is also true."""
         return replace(self, condition=f"{self.condition} AND ({condition})")
 
     def has(self, name: str) -> bool:
@@ -118,8 +118,8 @@ class StagedRows:
 class Staging:
     """Tables staged as one; `rows` are their rows.
 
-    `names` are the ids that were words, by assigned number; `offsets` are the numbers of each table's first row among
-    all rows, and the number of all rows.
+    `names` are the words for ids, by assigned number; `offsets` are the numbers of each table's first row among all
+    rows, and the number of all rows.
     """
 
     def __init__(
@@ -149,9 +149,9 @@ class Staging:
         if not self.offsets[-1]:
             raise ImportTableError(f"{paths[0]}: has a header but no rows")
         (self.blanks,) = StagedRows(db, "staged", ()).values("count(*) FILTER (blank)")
-        """Rows without a range, such as an empty cell of a wide table, that are left out."""
+        """Number of omitted rows without a range, such as an empty cell of a wide table."""
         self.beside: dict[str, Columns] = {}
-        """Rows of other tables of a recording that were found on the way, by table."""
+        """Further rows for other tables of a recording, by table."""
         self._filled = "NOT blank" if self.blanks else "true"
         others = tuple(name for name in columns if name not in (*ALL_IDS, "blank"))
         ids = selected(self._ids([n for n in ALL_IDS if n in columns]))
@@ -161,9 +161,9 @@ class Staging:
         self.rows = StagedRows(db, "rows", ("origin", *(n for n in ALL_IDS if n in columns), *others))
 
     def words_in(self, names: Iterable[str]) -> Iterator[str]:
-        """Yield a note for each of some columns that has cells that are no numbers, and are taken as missing.
+        """Yield a note for each of some columns with cells that are not numbers, which are treated as missing.
 
-        Raises `ImportTableError` if half of the cells or more that are not empty are none.
+        Raises `ImportTableError` if at least half of the non-empty cells are not numbers.
         """
         there = [
             name
@@ -171,7 +171,7 @@ class Staging:
             if self.rows.has(name) and name not in {*self.column_map.registers, *self.column_map.constants}
         ]
         lacking = self.rows.values(", ".join(f"count(*) - count({name})" for name in there)) if there else ()
-        none = "'', 'nan', 'none', 'null', 'na', 'n/a', '-', '--', 'inf', '-inf'"  # words for no number
+        none = "'', 'nan', 'none', 'null', 'na', 'n/a', '-', '--', 'inf', '-inf'"  # words for a missing number
         for name in (name for name, count in zip(there, lacking, strict=True) if count):
             header, cells = self.column_map.header(name), list[tuple[str, int, bool]]()
             for table in self.tables:
@@ -183,16 +183,16 @@ class Staging:
             words = [cell for cell in cells if cell[2]]
             count, total = sum(n for _, n, _ in words), sum(n for _, n, _ in cells)
             what = "plain degrees Celsius (-65 to 150)" if name in TEMPERATURES else "numbers"
-            said = f"{count} of {total} cells of column {header[:60]!r} are no {what}"
+            note = f"{count} of {total} cells of column {header[:60]!r} are no {what}"
             if words and 2 * count >= total:
                 first = json.dumps(words[0][0][:40])
                 remedy = f"name another column for {name} in the map, or state missing = [{first}]"
-                raise ImportTableError(f"{self.paths[0]}: {said}, such as {first}; {remedy}")
+                raise ImportTableError(f"{self.paths[0]}: {note}, such as {first}; {remedy}")
             if words:
-                yield f"{said}, such as {words[0][0][:40]!r}, and are taken as missing"
+                yield f"{note}, such as {words[0][0][:40]!r}, and are taken as missing"
 
     def require(self, rows: StagedRows, names: Iterable[str]) -> None:
-        """Raise the error for the first column that rows lack."""
+        """Raise the error for the first missing column."""
         for name in names:
             if not rows.has(name):
                 raise self.tables[0].missing(self.column_map.header(name))
@@ -218,7 +218,9 @@ class Staging:
         }
 
     def _number_words(self, words: list[str]) -> dict[str, int]:
-        """Return the number of each id: its own, the map's, or else the next free one in alphabetical order."""
+        """Return the number of each id: the id itself, the map's number, or else the next free one in alphabetical
+        order.
+        """
         numbers = numbers_of(words)
         if len(numbers) < len(words):
             numbers = numbers | self.column_map.ids
@@ -258,7 +260,7 @@ def staged_cells(table: SourceTable) -> dict[str, str]:
             blank = " OR ".join(filter(None, [blank, _is_missing(table, text)]))
     message = column_map.header("message")
     if message in table.names and all(n in constants or column_map.header(n) in table.named for n in IDS):
-        # The ids are of the pair for all messages; words tell which end sent one.
+        # The ids are the same pair for all messages; words tell which end sent a message.
         turned, (one, two) = is_by_target(table.text(message)), (found[n] for n in IDS)
         found |= {
             n: f"CASE WHEN {turned} THEN {a} ELSE {b} END" for n, a, b in zip(IDS, (two, one), (one, two), strict=True)
@@ -267,7 +269,7 @@ def staged_cells(table: SourceTable) -> dict[str, str]:
 
 
 def _is_missing(table: SourceTable, text: str) -> str:
-    """Return SQL that is true for a text that means no value, by the map."""
+    """Return SQL that is true for a text that means a missing value by the map."""
     missing = table.column_map.missing
     words = table.variable("missing", ["", *(one.strip().lower() for one in missing if isinstance(one, str))])
     numbers = ", ".join(repr(float(one)) for one in missing if not isinstance(one, str))
@@ -288,12 +290,12 @@ def _cell(table: SourceTable, name: str, text: str) -> str:
     if kind == "event":
         first = f"lower(left(trim({text}), 1))"
         return f"CASE WHEN {first} IN ('t', 's') THEN 1.0 WHEN {first} = 'r' THEN 2.0 END"
-    # Stamps in other units become ticks later, all of an exchange together (`plausibility.to_ticks`).
+    # Stamps in other units are converted to ticks later, all of an exchange together (`plausibility.to_ticks`).
     factor = column_map.factor(name)
     if kind == "stamps":
         return whole_number(text) if factor == 1.0 else number(text)
     value = number(text) + (f" * {factor!r}" if factor != 1.0 else "")
-    if name in TEMPERATURES:  # no chip that is stored at others reads again (DW1000 data sheet, maximum ratings)
+    if name in TEMPERATURES:  # storage temperatures (DW1000 data sheet, maximum ratings)
         return f"CASE WHEN {value} BETWEEN -65 AND 150 THEN {value} END"
     if column_map.missing and name in ("range_m", "difference_m", "gt_range_m", *POWERS, *SKEWS):
         return f"CASE WHEN NOT {_is_missing(table, text)} THEN {value} END"
@@ -306,7 +308,7 @@ SUMMARIES: Final = frozenset(
         "rmse", "mittelwert", "summe", "anzahl",
     }
 )  # fmt: skip
-"""Words in place of an id that mark a row as a summary of others."""
+"""Words instead of an id that mark a row as a summary of others."""
 
 
 def numbers_of(words: Iterable[str]) -> dict[str, int]:
@@ -316,7 +318,7 @@ def numbers_of(words: Iterable[str]) -> dict[str, int]:
 
 
 def rows_back(rows: StagedRows) -> tuple[int, float]:
-    """Return how many rows are earlier than the one before, and by how many seconds at most."""
+    """Return the number of rows that are earlier than the previous one, and the largest difference in seconds."""
     if not rows.has("time_s"):
         return 0, 0.0
     steps = f"SELECT lag(time_ns) OVER () - time_ns AS back FROM {rows.name} WHERE {rows.condition}"
@@ -325,7 +327,7 @@ def rows_back(rows: StagedRows) -> tuple[int, float]:
 
 
 def in_time_order(rows: StagedRows) -> StagedRows:
-    """Return the rows in order of time, those of one time in their order."""
+    """Return the rows in order of time; rows with equal times keep their order."""
     if not rows_back(rows)[0]:
         return rows
     listed = f"SELECT {', '.join(rows.columns)} FROM {rows.name} WHERE {rows.condition} ORDER BY time_ns, rowid"
@@ -353,7 +355,7 @@ OF_DIFFERENCES: Final = (
     Condition("at_id", f"a whole number from 0 to {LARGEST_ID}", "at_id IS NULL"),
     Condition("at_id", "another tag than from_id and to_id", "at_id IN (from_id, to_id)"),
 )
-"""Further conditions where a tag measured the difference of arrival from both."""
+"""Further conditions if a tag measured the difference of arrival from both."""
 
 
 class Faults:
@@ -366,7 +368,7 @@ class Faults:
         staging.db.execute("CREATE TABLE faulty (origin BIGINT, reason INTEGER)")
 
     def reject(self, rows: StagedRows, conditions: Sequence[Condition]) -> StagedRows:
-        """Record the rows that fulfil a condition as unusable; returns the others."""
+        """Record the rows that meet a condition as unusable; returns the others."""
         cases = " ".join(f"WHEN {one.wrong} THEN {k}" for k, one in enumerate(conditions, start=len(self._reasons)))
         self._reasons += conditions
         query = f"SELECT origin, CASE {cases} END AS reason FROM {rows.name} WHERE {rows.condition}"
@@ -378,7 +380,7 @@ class Faults:
         return int(self._staging.db.execute("SELECT count(*) FROM faulty").fetchall()[0][0])
 
     def __iter__(self) -> Iterator[list[Fault]]:
-        """Yield blocks of faults, those of each file in the order of their rows, then rows with too many cells."""
+        """Yield blocks of faults: for each file in the order of rows, then rows with too many cells."""
         staging, timed = self._staging, self._staging.rows.has("time_s")
         query = (
             f"SELECT origin, reason, {'coalesce(time_ns, 0)' if timed else '0'} FROM faulty JOIN rows USING (origin) "
@@ -420,7 +422,7 @@ class Faults:
 
 
 def time_conditions(rows: StagedRows) -> list[Condition]:
-    """Return the condition that a row has a time, none where there is no column of times."""
+    """Return the condition that a row has a time; none if there is no column of times."""
     return [Condition("time_s", "a time", "time_ns IS NULL")] if rows.has("time_s") else []
 
 
@@ -467,10 +469,10 @@ def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Wat
     message, follows = "place", ""
     if of_messages and rows.has("message"):
         some, zeros, largest = rows.values("count(message), count(*) FILTER (message = 0), max(message)")
-        # Numbers begin at 0 if many are 0; a few zeros are damaged cells.
+        # Numbers start at 0 if many are 0; a few zeros are damaged cells.
         message = "message + 1" if some and largest <= 2 and 4 * zeros > some else "message"
-        # A group ends where a message does not follow the one before. Stamps of one message have any order; those of a
-        # sequence are told by its number, because the devices' logs may be out of step.
+        # A group ends if a message does not follow the previous one. Stamps of one message have any order; with numbers
+        # of exchanges these identify a group, because the devices' logs may be out of step.
         follows = "message > lag(message) OVER ()" if layout == "messages" else ""
         follows = "message >= lag(message) OVER ()" if layout == "stamps" and not rows.has("sequence") else follows
     first, cells = f"{message} = 1", dict[str, tuple[str, str]]()
@@ -484,10 +486,10 @@ def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Wat
             cells |= {f"{name}{n}": (cell, f"{message} = {n}") for name, cell in theirs.items()}
         cells |= {name: (name, "true") for name in ("gt_range_m", "range_m") if rows.has(name)}
     else:
-        # The initiator is whoever the row with its first stamp names first.
+        # The initiator is the first id in the row with the first stamp.
         first = "tx1 IS NOT NULL" if rows.has("tx1") else "false"
         cells = {name: (name, "true") for name in rows.columns if name not in ("origin", *IDS, "time_ns")}
-    # The rows of messages are told apart by their numbers.
+    # Numbers distinguish the rows of messages.
     told_apart = STAMPS if layout != "messages" else ()
     twice = [f"count({cell}) FILTER ({where}) > 1" for n, (cell, where) in cells.items() if n in told_apart]
     values: dict[str, str] = {
@@ -512,9 +514,9 @@ def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Wat
 
 
 def broadcast_exchanges(staging: Staging, faults: Faults, notes: list[str]) -> tuple[StagedRows, str]:
-    """Return the exchanges that broadcasts make whose senders list what they heard, and their protocol; adds to notes.
+    """Return the exchanges in broadcasts whose senders list receptions, and their protocol; adds to notes.
 
-    The receptions, and what third tags overheard of the exchanges, are put beside. Raises `ImportTableError`.
+    Adds the receptions, and overheard exchanges of third tags, to the other rows. Raises `ImportTableError`.
     """
     staging.require(staging.rows, ("tx", "rx", "sequence", "heard"))
     if staging.column_map.factor("tx") != 1.0:
@@ -524,7 +526,7 @@ def broadcast_exchanges(staging: Staging, faults: Faults, notes: list[str]) -> t
     sample, db = rows.sample(SAMPLE_ROWS), staging.db
     bits, _ = counter_format((sample[name] for name in ("tx", "rx")), staging.column_map.bits, "wrapped")
     named = "from_id, sequence, tx, min(origin) AS first" + (", min(time_ns) AS time_ns" if rows.has("time_s") else "")
-    # Without times, a restart (numbers begin anew) lasts longer than a counter takes to wrap, so that nothing spans it.
+    # Without times, a restart (numbers restart) takes longer than a wrap of the counter, so no exchange spans it.
     again = "sum(coalesce((sequence < before)::INT, 0)) OVER (ORDER BY first)"
     time = f"{again} * {round(2**bits * TICK_S * 2e9)} AS time_ns"
     db.execute(
@@ -532,7 +534,7 @@ def broadcast_exchanges(staging: Staging, faults: Faults, notes: list[str]) -> t
         f"lag(sequence) OVER (PARTITION BY from_id ORDER BY first) AS before FROM (SELECT {named} FROM {rows.name} "
         f"WHERE {rows.condition} GROUP BY from_id, sequence, tx)) ORDER BY first"
     )
-    # Numbers of frames begin anew where a board restarts. A broadcast may be logged after those that list it.
+    # Numbers of frames restart if a board restarts. A broadcast may be logged after broadcasts that list it.
     heard = (
         "SELECT f.time_ns, f.rowid AS frame, f.from_id AS sender, r.from_id AS listener, f.tx, min(r.rx) AS rx "
         f"FROM (SELECT *, origin + 1000 AS until FROM {rows.name} WHERE {rows.condition}) r ASOF JOIN frames f "
@@ -560,8 +562,8 @@ def broadcast_exchanges(staging: Staging, faults: Faults, notes: list[str]) -> t
 def _group(rows: StagedRows, values: Mapping[str, str], follows: str, within_s: float) -> StagedRows:
     """Return a table with one row for each group; `values` are its columns as SQL aggregates over the group's rows.
 
-    In these `first` is true for the first row of a group, and `place` counts its rows from 1. Rows are sorted by keys,
-    time and original order. A group also ends where the condition `follows` is not true.
+    In them `first` is true for the first row of a group, and `place` counts its rows from 1. Rows are sorted by keys,
+    time and original order. A group also ends if the condition `follows` is not true.
     """
     # DuckDB sorts in half the time if the keys have 32 bytes or less, including one for each column.
     cells = {name: name for name in rows.columns}

@@ -1,11 +1,11 @@
 """Tables in CSV, Parquet or JSON lines, read by DuckDB: SQL expressions of their columns, and columns as arrays.
 
-DuckDB can open the named files only, and text of a file or a map never becomes SQL: columns are named by their number,
-and paths and JSON keys are variables of the connection. Dialect, limits of lines and line numbers of CSV files are
-found here, because DuckDB reports none of them reliably.
+DuckDB can open only the named files, and text of a file or a map is never part of SQL: columns are named by their
+number, and paths and JSON keys are variables of the connection. Dialect, limits of lines and line numbers of CSV files
+are found here, because DuckDB reports none of them reliably.
 
-Whatever the form of a file, its rows become those of one long table here: lines of a log by a template, elements of a
-list (`each`), and columns that differ by a device (`wide`) become rows, and values in the name of a file columns.
+Files of every form are converted to one long table: lines of a log by a template, elements of a list (`each`), and
+columns that differ by a device (`wide`) become rows, and values in the name of a file become columns.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from uwblink.text_files import require_regular
 from uwblink.twr import LATEST_NS
 
 MAX_LINE_BYTES: Final = 4_000_000
-"""An impulse response in one cell takes 6,000."""
+"""Maximum length of a line; an impulse response in one cell takes 6,000."""
 
 MAX_CELLS: Final = 4096
 """Cells of a row; an impulse response in cells of its own takes 2,032."""
@@ -67,7 +67,7 @@ def _refuse_utf16(path: Path, raw: bytes) -> None:
 
 
 def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, bool, int]:
-    """Return the dialect of a CSV file by its first 64 KiB, as far as the map does not state it.
+    """Return the dialect of a CSV file by its first 64 KiB, for parts that the map does not state.
 
     It consists of the names of the columns, the delimiter, whether the decimal mark is a comma, and the number of lines
     before the first row of values. Without a header the names are "1", "2" and so on. Lines before the header that are
@@ -77,7 +77,7 @@ def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, boo
     with reading(path), open_file(path) as file:
         raw = file.read(65_536)
         _refuse_utf16(path, raw)
-        # A letter of several bytes may be cut in two at the end of what was read.
+        # A letter of several bytes may be cut at the end of the read bytes.
         lines = raw.decode("utf-8-sig", errors="strict" if len(raw) < 65_536 else "ignore").splitlines()
         first = next((k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
         mark = delimiter or _delimiter(lines[first:])
@@ -99,7 +99,9 @@ def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, boo
 
 
 def lacks_header(names: Sequence[str]) -> bool:
-    """Return whether the first line of a table is a row of numbers; 0, 1, 2 ... are names that a program wrote."""
+    """Return whether the first line of a table is a row of numbers, except 0, 1, 2 ..., which are names written by a
+    program.
+    """
     numbers = [name for name in names if re.fullmatch(r"[-+]?[0-9]+([.,][0-9]*)?([eE][-+]?[0-9]+)?", name)]
     if [name for name in names if name] == [str(k) for k in range(len(numbers))]:
         return False
@@ -127,7 +129,7 @@ def check_lines(path: Path, delimiter: str) -> None:
             _refuse_utf16(path, piece if line == 1 else b"")
             ends = piece.count(b"\n")
             line += ends
-            # Only lines that fill whole pieces are measured, so that short ones take no time.
+            # Only lines that fill whole pieces are measured, which saves time for short ones.
             length, cells = (0, 0) if ends else (length + len(piece), cells + piece.count(delimiter.encode()))
             if length > MAX_LINE_BYTES or cells > MAX_CELLS:
                 most = f"{MAX_CELLS} cells" if cells > MAX_CELLS else f"{MAX_LINE_BYTES} bytes"
@@ -171,7 +173,7 @@ def whole_number(text: str) -> str:
 
 
 REPORT: Final = "report|range_?report"
-"""A third message of the target, where a final is of the initiator."""
+"""Word for a third message of the target; a final is a message of the initiator."""
 
 
 def is_by_target(text: str) -> str:
@@ -189,7 +191,7 @@ def message_number(text: str) -> str:
 def time_ns(text: str, unit: str | None, ns_per_unit: float) -> str:
     """Return SQL of a time as nanoseconds, NULL if it is none: a number in units, or ISO 8601, UTC without a zone.
 
-    Without a unit both are read, with "iso" only the latter; a time of day counts from midnight.
+    Without a unit both are read, with "iso" only the latter; a time of day is counted from midnight.
     """
     scaled = f"TRY_CAST({number(text)} * {ns_per_unit!r} AS BIGINT)"
     scaled = f"coalesce({whole_number(text)}, {scaled})" if unit == "ns" else scaled
@@ -217,7 +219,7 @@ class SourceTable:
     ) -> None:
         """Open a CSV file (plain or gzipped), a Parquet file or JSON lines, by its suffix, or a log by its template.
 
-        A `live` log has the lines of the variable `lines` of the connection, in place of those of a file. Raises
+        A `live` log has the lines in the variable `lines` of the connection, instead of a file. Raises
         `ImportTableError`. Tables of one connection have different keys.
         """
         self.live = live
@@ -227,11 +229,11 @@ class SourceTable:
         self.column_map = column_map = column_map or ColumnMap()
         self._skip, self._decimal_comma, self._expanded = 0, False, False
         self.named: frozenset[str] = frozenset()
-        """Columns that the name of the file says."""
+        """Columns with values in the name of the file."""
         self.lists: tuple[str, ...] = ()
         """Fields of JSON lines that are lists of objects."""
         self.blank = ""
-        """SQL that is true for rows that hold no range at all, such as an empty cell of a wide table; "" for none."""
+        """SQL that is true for rows without any range, such as an empty cell of a wide table; "" for none."""
         self._file = self.variable("file", str(path))
         ending = path.name.lower().removesuffix(".gz")
         self._is_parquet = ending.endswith(".parquet")
@@ -267,7 +269,7 @@ class SourceTable:
         )
 
     def _open_log(self) -> None:
-        """Use the lines that a template matches, and each match of the other (`each`) in them as a row."""
+        """Use the lines that match a template, and each match of a second one (`each`) in them as a row."""
         line = Template(self.column_map.line or "")
         self._decimal_comma = self.column_map.decimal == ","
         pattern, cells = self.variable("line", line.pattern), line.columns("s")
@@ -281,7 +283,7 @@ class SourceTable:
         self.names, self._cells, self._expanded = tuple(cells), list(cells.values()), True
 
     def _source_of_lines(self) -> str:
-        """Return SQL of the lines of a log; whatever noise of a serial port is in it is read as letters."""
+        """Return SQL of the lines of a log; noise of a serial port is read as letters."""
         if self.live:
             return "(SELECT unnest(getvariable('lines')) AS line)"
         check_lines(self.path, "\n")
@@ -319,7 +321,7 @@ class SourceTable:
             ends = f"SELECT TRY_CAST(regexp_extract(line, '[{{].*') AS JSON) AS json FROM {self._source_of_lines()}"
             self.source = f"(SELECT json FROM ({ends}) WHERE json_type(json) = 'OBJECT')"
         if each:
-            # An element stands in place of the list that it is of.
+            # An element replaces its list.
             name = self.variable("each", each)
             escaped = f"replace(replace({name}, '~', '~0'), '/', '~1')"
             elements = f"unnest(CAST(json_extract(json, '/' || {escaped}) AS JSON[])) AS element"
@@ -354,12 +356,12 @@ class SourceTable:
         self.source = f"(SELECT *{numbered}, unnest(range(1, {len(labels) + 1})) AS k FROM {self.source})"
         value = "range_m" if "range_m" in families else next(iter(families))
         self.blank = f"trim({cells[value]}) = ''"
-        if "mask" in self.names:  # of bits: which of the devices answered
+        if "mask" in self.names:  # a mask of bits: the devices that answered
             self.blank += f" OR TRY_CAST({self.text('mask')} AS BIGINT) & (1 << (k - 1)) = 0"
         self.names, self._cells, self._expanded = (*self.names, *cells), [*self._cells, *cells.values()], True
 
     def _family(self, ours: str, stated: str | dict[str, str]) -> dict[tuple[str, ...], str]:
-        """Return the columns of a family by what differs in their names."""
+        """Return the columns of a family by the different part of their names."""
         if isinstance(stated, dict):
             return {(label,): name for label, name in stated.items()}
         pattern = "(.+)".join(map(re.escape, re.split(r"\{\w+\}", stated)))
@@ -370,7 +372,7 @@ class SourceTable:
         return found
 
     def _add_names(self) -> None:
-        """Add what the name of the file says (`from_name`) as columns."""
+        """Add values in the name of the file (`from_name`) as columns."""
         if self.column_map.from_name is None:
             return
         values = Template(self.column_map.from_name).match(self.path.as_posix())
@@ -382,7 +384,7 @@ class SourceTable:
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Convert DuckDB's errors about the file into `ImportTableError`; errors of the disk pass."""
+        """Convert DuckDB's errors about the file into `ImportTableError`; errors of the disk are passed on."""
         try:
             yield
         except duckdb.Error as error:
@@ -403,7 +405,7 @@ class SourceTable:
         return f"replace({text}, ',', '.')" if numeric and self._decimal_comma else text
 
     def missing(self, header: str) -> ImportTableError:
-        """Return the error for a column that is not there."""
+        """Return the error for a missing column."""
         remedy = "a `map_file` can rename columns or give constants, and `uwblink import guess` proposes one"
         if lacks_header(self.names):
             remedy = "its first line is a row of values: give the numbers of its columns in a map, such as from_id = 2"
@@ -438,7 +440,7 @@ class SourceTable:
         return {row: dict(zip(names, texts, strict=True)) for row, *texts in found}
 
     def rejected(self) -> list[int]:
-        """Return the line numbers of rows with too many cells, which are not read, in ascending order."""
+        """Return the line numbers of rows with too many cells, which are skipped, in ascending order."""
         query = f"SELECT DISTINCT line FROM rejects{self._key} ORDER BY line"
         return [int(line) for (line,) in self.db.execute(query).fetchall()] if self._is_csv else []
 
@@ -449,7 +451,7 @@ class SourceTable:
 
     @cached_property
     def _origins(self) -> Ints:
-        """The row of the file, from 0, that each row comes from."""
+        """The row of the file, from 0, of each row."""
         found = self.db.execute(f"SELECT row - 1 AS row FROM {self.source}").fetchnumpy()
         return np.asarray(np.ma.getdata(found["row"]), np.int64)
 
@@ -483,7 +485,7 @@ def _fields(row: dict[str, Any], name: str, pointer: str) -> Iterator[tuple[str,
     """Yield names of fields such as `pose.x` or `ranges.0`, and their JSON pointers."""
     for key, value in row.items():
         where = f"{pointer}/{key.replace('~', '~0').replace('/', '~1')}"
-        # A list of objects is a column of JSON; long lists are images and the like.
+        # A list of objects is a column of JSON; long lists are images or similar data.
         of_numbers = isinstance(value, list) and len(value) <= 16 and not is_objects(value)
         inner = {str(k): one for k, one in enumerate(value)} if of_numbers else value
         if isinstance(inner, dict) and pointer.count("/") < 5:

@@ -2,8 +2,8 @@
 
 `Range: {range_m} m` finds a number after the text. A place is `{name}`; `{name:hex}` and `{name:int}` take only digits;
 `{name[8]}` is a list of up to eight values, which become the columns `name.0` to `name.7`; `{_}` is not used, and `{*}`
-is any text. The expressions use what RE2 and Python's `re` have in common. DuckDB applies them with RE2, whose time is
-linear in the text, so that a template of a stranger cannot stall an import.
+is any text. The expressions use common syntax of RE2 and Python's `re`. DuckDB applies them with RE2, whose time is
+linear in the text, so an untrusted template cannot stall an import.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _VALUES: Final = {
     "_": r"[^\s,;()\[\]{}=]*?",
     "*": ".*?",
 }
-"""Expressions of values by the form of a place; the first is a time with a blank in it, or text without one."""
+"""Expressions of values by the form of a place; the first is a time with a blank in it, or text without a blank."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,9 @@ class Template:
 
     @cached_property
     def pattern(self) -> str:
-        """The regular expression, a group a place. Blanks match any; after commas and colons they may be missing."""
+        """The regular expression, a group a place. Blanks match any number of blanks; after commas and colons they may
+        be missing.
+        """
         parts, end = list[str](), 0
         for place in _PLACE.finditer(self.text):
             name, form = place["name"], "list" if place["count"] else place["form"] or ""
@@ -82,7 +84,7 @@ def places(template: Template) -> list[str]:
 
 
 def _literal(text: str) -> str:
-    """Return the expression of literal text; a letter outside ASCII is any such letters, in any encoding."""
+    """Return the expression of literal text; a letter outside ASCII matches any such letters, in any encoding."""
     parts = re.findall(r"\s+|[^\x00-\x7f]+|[,:]\s*|.", text)
     return "".join(
         r"\s+"

@@ -1,7 +1,7 @@
 """Links between antennas, their ends, and the lengths and powers of their paths, by a table of effects.
 
 Simulated flights, served boards, passive listeners and comparisons of protocols all call `link_between`, so each effect
-of `CHANNEL_EFFECTS` applies to all of them alike.
+of `CHANNEL_EFFECTS` applies to all of them equally.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Link(ArrayRows):
 
     `distance_m` is the length of the straight line, `excess_m` the apparent additional length of the first detected
     path; `power_dbm` is that path's power, `total_dbm` that of all paths together. `paths_m` and `paths_dbm` are the
-    lengths and powers of all paths, (n, paths), in any order. With geometric responses, whose paths are their own,
+    lengths and powers of all paths, (n, paths), in any order. With geometric responses, which have their own paths,
     `noise_s` is the standard deviation of the leading edge of the first path by noise.
     """
 
@@ -129,12 +129,12 @@ class Ends:
 
 
 def paths_heard(link: Link, ends: Ends, detour_m: Floats) -> list[PathsHeard]:
-    """Return the paths of n links as impulse responses show them; first paths have random detours (n,)."""
+    """Return the paths of n links for impulse responses; first paths have random detours (n,)."""
     first_m, responses = link.distance_m + link.excess_m, ends.world.responses
     if responses is not None:
         paths, read = responses.paths(ends.places, ends.time_s), responses.at(ends.places, ends.time_s)
         later_s = (paths.detour_m - (read.excess_m + detour_m)[:, None]) / SPEED_OF_LIGHT
-        # Other effects on a link change all its paths alike.
+        # Other effects on a link change all its paths equally.
         amplitude = paths.amplitude * 10 ** ((link.power_dbm - read.power_dbm) / 20)[:, None]
         return [PathsHeard(*path) for path in zip(link.power_dbm.tolist(), later_s, amplitude, strict=True)]
     later_m = link.paths_m - first_m[:, None] - detour_m[:, None]
@@ -154,7 +154,7 @@ ChannelEffect = Callable[[Link, Ends], Link]
 def link_between(ends: Ends) -> Link:
     """Return the links between known ends, (n,), after all effects of `CHANNEL_EFFECTS` in their order."""
     power = nothing = np.zeros_like(ends.distance_m)
-    if ends.world.responses is None:  # geometric responses have the powers, too
+    if ends.world.responses is None:  # geometric responses also have the powers
         gain = ends.gain_towards_db(ends.towards, -ends.towards)
         power = path_gain_db(ends.scenario.radio, ends.distance_m) + gain
     link = Link(ends.distance_m, nothing, power, power, ends.distance_m[:, None], power[:, None])
@@ -193,7 +193,7 @@ def _shadows(link: Link, ends: Ends) -> Link:
 
 
 def _reflections(link: Link, ends: Ends) -> Link:
-    """Add the reflections by the room's surfaces, with the losses of obstacles and bodies on them.
+    """Add the reflections by the room's surfaces, with the losses by obstacles and bodies.
 
     The image method: the straight line to the image of the other end has the length of the reflected path, and crosses
     the surface at the point of reflection. The first detected path is the earliest whose power is within the dynamic
@@ -208,7 +208,7 @@ def _reflections(link: Link, ends: Ends) -> Link:
     way, back = images[1] - spots[0], images[0] - spots[1]
     length = np.linalg.norm(way, axis=2)
     scale = np.maximum(length, 1e-10)[:, :, None]
-    # The distances of the two ends from the surface give the point of reflection.
+    # The distances of the two ends from the surface determine the point of reflection.
     near, far = (np.linalg.norm(image - end, axis=2) for image, end in zip(images, spots, strict=True))
     point = spots[0] + (near / np.maximum(near + far, 1e-10))[:, :, None] * way
     leaving, arriving = way / scale, back / scale
@@ -269,7 +269,7 @@ def _states(link: Link, ends: Ends) -> Link:
 
 
 def _response(link: Link, ends: Ends) -> Link:
-    """Take excess length, powers and noise from geometric responses; the effects above skip links that have one."""
+    """Use excess length, powers and noise of geometric responses; the effects above skip links with one."""
     if ends.world.responses is None:
         return link
     read = ends.world.responses.at(ends.places, ends.time_s)
@@ -302,18 +302,18 @@ CHANNEL_EFFECTS: Final[dict[str, ChannelEffect]] = {
     "fading and outages": _levels,
     "group delays": _group_delays,
 }
-"""Effects on every link of every scenario, in this order; those of plug-ins come last."""
+"""Effects on every link of every scenario, in this order; effects of plug-ins are last."""
 
 OWN_EFFECTS: Final = tuple(CHANNEL_EFFECTS)
-"""Effects that follow from the scenario alone."""
+"""Effects that depend only on the scenario."""
 
 
 def register_channel_effect(name: str, effect: ChannelEffect) -> None:
     """Add an effect to every link that is simulated from now on; `del CHANNEL_EFFECTS[name]` removes it.
 
-    `effect(link, ends)` is given n links (`Link`: distances and excess lengths in metres, powers in dBm, (n,) each) and
-    their two ends (`Ends`), and returns links. It must depend on nothing else, so that the same seed gives the same
-    flight. It applies to flights, served boards, passive listeners, and predictions and comparisons of protocols.
+    `effect(link, ends)` gets n links (`Link`: distances and excess lengths in metres, powers in dBm, (n,) each) and
+    their two ends (`Ends`), and returns links. It must not depend on anything else, so that the same seed gives the
+    same flight. It applies to flights, served boards, passive listeners, and predictions and comparisons of protocols.
     Raises `ParameterError` for a name that is taken.
 
     >>> from dataclasses import replace

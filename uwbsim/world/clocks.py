@@ -161,7 +161,7 @@ class Clocks:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
-        """Create the clocks of a scenario; random walks, and offsets that it does not give, are drawn from its seed."""
+        """Create the clocks of a scenario; random walks, and offsets that are not given, are drawn from its seed."""
         seed, duration = scenario.run.seed, scenario.run.duration_s
         steps, offsets, rates = int(duration / WALK_STEP_S) + 20, [], []
         for tag in scenario.tags:
@@ -184,22 +184,22 @@ class Clocks:
         return cls(np.array(offsets, dtype=np.int64), skew, rate, walk, noise)
 
     def read(self, tag: Ints, time: Ints) -> Ints:
-        """Return what the clocks of tags (n,) read at true times (n,), in sub-ticks, not wrapped."""
+        """Return the readings of the clocks of tags (n,) at true times (n,), in sub-ticks, not wrapped."""
         return time + self.offset[tag] + self._deviation(tag, time)
 
     def when(self, tag: Ints, reading: Ints) -> Ints:
-        """Return the true times (n,) at which clocks show `reading`: the inverse of `read`."""
+        """Return the true times (n,) of clock readings: the inverse of `read`."""
         time = bare = reading - self.offset[tag]
-        # Each pass shrinks the error by the skew, so three take 0.1 s of deviation below a sub-tick.
+        # Each pass multiplies the error by the skew, so three passes reduce 0.1 s of deviation below a sub-tick.
         for _ in range(4):
             time = bare - self._deviation(tag, time)
         return time
 
     def rate(self, tag: Ints, time: Ints, span_s: float = RATE_SPAN_S) -> Floats:
-        """Return the clocks' rates less that of true time, as fractions, (n,).
+        """Return the deviations of the clocks' rates from true time, as fractions, (n,).
 
-        White noise has no rate at an instant: its part is the mean over `span_s` before, by default the length of a
-        preamble, over which the carrier integrator averages.
+        White noise has no rate at an instant: its contribution is the mean over the previous `span_s`, by default the
+        length of a preamble, over which the carrier integrator averages.
         """
         rate = self.skew[tag] + self.walk_rate[tag, self._step(time)[0]]
         if self.noise is None:
@@ -247,7 +247,9 @@ def slope_of(tag: ScenarioTag, devices: Devices, name: str) -> float:
 
 
 def range_shift_m(scenario: Scenario, tag: ScenarioTag, time_s: Floats) -> Floats | None:
-    """Return what a tag's temperature and voltage add to ranges at times (n,); None for a tag without an effect."""
+    """Return the change of ranges by a tag's temperature and voltage at times (n,); None for a tag without
+    an effect.
+    """
     d = scenario.devices
     effects = (
         (profile_of(scenario, tag, "temperature_c"), slope_of(tag, d, "range_mm_per_k") * 1e-3, d.reference_c),
@@ -258,7 +260,7 @@ def range_shift_m(scenario: Scenario, tag: ScenarioTag, time_s: Floats) -> Float
 
 
 def thermal_rate(scenario: Scenario, tag: ScenarioTag, time_s: Floats) -> Floats:
-    """Return what temperature and warm-up add to the rate of a tag's clock at times (n,), as a fraction."""
+    """Return the change of the rate of a tag's clock by temperature and warm-up at times (n,), as a fraction."""
     rate = tag.warm_up_ppm * 1e-6 * np.exp(-time_s / tag.warm_up_s)
     profile, slope = profile_of(scenario, tag, "temperature_c"), slope_of(tag, scenario.devices, "skew_ppm_per_k")
     if profile is not None and slope:

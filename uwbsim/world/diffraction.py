@@ -91,7 +91,7 @@ def edge_gain(nu: Floats) -> Floats:
 def blocked_fraction(nu: Floats) -> Complexes:
     """Return the fraction of a wave front that a half plane with an edge at nu blocks: a complex Fresnel integral.
 
-    0 far from the shadow, 1/2 at grazing incidence, 1 deep in the shadow; the remaining field is one less it.
+    0 far from the shadow, 1/2 at grazing incidence, 1 deep in the shadow; the remaining field is 1 minus this.
     """
     place = np.clip((nu + MAX_NU) * STEPS_PER_UNIT, 0, 2 * MAX_NU * STEPS_PER_UNIT)
     step = np.minimum(place.astype(np.intp), int(2 * MAX_NU * STEPS_PER_UNIT) - 1)
@@ -119,7 +119,7 @@ def fresnel_number(depth_m: Floats, share: Floats, length_m: Floats) -> Floats:
 def boxes_blocked(obstacles: Sequence[Obstacle], a: Floats, b: Floats) -> tuple[Complexes, Floats]:
     """Return the fraction of the wave front that boxes block on segments (n, 3) to (n, 3), and nu of the nearest edge.
 
-    Shapes (n, boxes) each. The two edges left and right bound a strip, the nearer ones above and below another; the
+    Shapes (n, boxes) each. The left and right edges bound one strip, the nearer edges above and below another; the
     blocked fraction is their product, as for a rectangular screen. It is 0 for boxes that are not between the ends.
     """
     low, high = (np.array([getattr(box, name) for box in obstacles]) for name in ("min_m", "max_m"))
@@ -166,7 +166,7 @@ def _nearer(one: tuple[Floats, Floats], other: tuple[Floats, Floats]) -> tuple[F
 def near_body(shadow: Shadow, start: Floats, way: Floats) -> Ints:
     """Return the indices of segments that an ellipsoid may shade; `start` (n, 3) are their starts from its centre.
 
-    Others, most of them, pass at more than the largest radius of a Fresnel zone.
+    The other segments, which are most, pass at more than the largest radius of a Fresnel zone.
     """
     squared = np.maximum(_dot(way, way), LEAST_SIDE_M**2)
     share = np.clip(-_dot(start, way) / squared, 0, 1)
@@ -179,7 +179,7 @@ def body_gain(shadow: Shadow, a: Floats, b: Floats) -> Floats:
     """Return the relative field around and through an ellipsoid on segments (n, 3) to (n, 3) in its frame.
 
     It blocks the product of two strips, one between its near and its far edge, one across. The blocked part of the
-    field goes through with the loss per metre of the ellipsoid.
+    field passes through with the loss per metre of the ellipsoid.
     """
     start, way = a - np.array(shadow.centre_m), b - a
     length_m = np.sqrt(np.maximum(_dot(way, way), LEAST_SIDE_M**2))
@@ -202,7 +202,9 @@ def body_gain(shadow: Shadow, a: Floats, b: Floats) -> Floats:
 
 
 def _offset_direction(point: Floats, way: Floats, flattest: int) -> Floats:
-    """Return the direction of a path's offset from the centre; for one through it, a normal on the flattest axis."""
+    """Return the direction of a path's offset from the centre; for a path through the centre, a normal on the flattest
+    axis.
+    """
     across = np.cross(way, np.eye(3)[flattest])
     across[_dot(across, across) < PARALLEL] = np.eye(3)[flattest - 1]
     centred = _dot(point, point) < 1e-4**2  # metres
@@ -231,8 +233,8 @@ def permittivity(material: str | Material) -> complex:
 def fresnel(relative_permittivity: Complexes | complex, cosine: Floats) -> tuple[Complexes, Complexes]:
     """Return the reflection coefficients of the field across and in the plane of incidence, same shape as `cosine`.
 
-    `cosine` is that of the angle to the surface normal. In the plane the sign is that of the magnetic field: a perfect
-    conductor has -1 and +1 (ITU-R P.2040-3, equations 31a and 31b).
+    `cosine` is the cosine of the angle to the surface normal. In the plane the sign is the sign of the magnetic field:
+    a perfect conductor has -1 and +1 (ITU-R P.2040-3, equations 31a and 31b).
     """
     inside = np.sqrt(relative_permittivity - (1 - cosine**2) + 0j)
     along = relative_permittivity * cosine
@@ -309,8 +311,8 @@ def reflection_gain(mirrors: Mirrors, axes: tuple[Floats, Floats], way: Floats, 
 
     `axes` (n, 3) each are those of the two antennas, `way` (3, n, mirrors) unit vectors k towards the image, `cosine`
     their components along the normals n. The axis of the other antenna is replaced by its image. The polarisation of an
-    antenna is its axis z less the component along k. Its part along n x k has the first Fresnel coefficient, the part
-    across the second.
+    antenna is its axis z minus the component along k. Its part along n x k has the first Fresnel coefficient, the part
+    across it the second.
     """
     columns, axis = np.arange(len(mirrors.axis)), mirrors.axis
     next_one, last_one = (axis + 1) % 3, (axis + 2) % 3

@@ -1,7 +1,6 @@
 """Impulse responses of links from geometry: direct path, reflections by faces, and scatterers.
-
-`GeometricResponses.paths` computes the paths of many links at once, and `at` what receivers read from their responses.
-A pair has one response every few milliseconds, and all that ask for it get that of the nearest step.
+`GeometricResponses.paths` computes the paths of many links at once, and `at` the readings of receivers from their
+responses. A pair has one response every few milliseconds; each call returns the response of the nearest step.
 """
 
 from __future__ import annotations
@@ -60,7 +59,7 @@ def antenna_tables(scenario: Scenario, phases: Floats) -> Floats:
         gain = 10 ** (antenna_gain_db(scenario, phases, np.full(len(directions), place), directions) / 20)
         if shadow := shadows[tag.body]:
             arm = np.broadcast_to(np.array(tag.lever_arm_m), directions.shape)
-            # Seen from 3 m away, further than the shadow of its own body reaches.
+            # From a distance of 3 m, further than the shadow of the tag's own body.
             gain = gain * body_gain(shadow, arm, arm + 3.0 * directions)
         tables.append(gain)
     return np.array(tables)
@@ -89,7 +88,9 @@ class Scatterers:
 
     @classmethod
     def of(cls, scenario: Scenario, model: GeometricMultipath) -> Self:
-        """Draw the scatterers of a scenario; each property has a stream, so that more of them do not move the first."""
+        """Draw the scatterers of a scenario; each property has its own random stream, so that more scatterers do not
+        change the first ones.
+        """
         room, names = scenario.room, ("places", "bounces", "fields")
         count = model.scatterers if room else 0
         places, extra, field = (stream(scenario.run.seed, "scatterers", name) for name in names)
@@ -130,13 +131,13 @@ def _inside_boxes(boxes: Sequence[Obstacle], a: Floats, b: Floats) -> tuple[Floa
 
 
 class GeometricResponses:
-    """The paths of a world's pairs of tags, and what receivers read from their responses; computed readings are kept.
+    """The paths of a world's pairs of tags, and readings of receivers from their responses; computed readings are kept.
 
     Both directions of a pair have one response, unless the tags' powers differ, which changes detection.
     """
 
     def __init__(self, world: World, model: GeometricMultipath) -> None:
-        """Collect the faces, draw the scatterers, tabulate the antennas; responses are computed when asked for."""
+        """Collect the faces, draw the scatterers, tabulate the antennas; responses are computed when needed."""
         self.world, self.model, self.scenario = world, model, world.scenario
         self.mirrors = Mirrors.of(world.scenario)
         self.scatterers = Scatterers.of(world.scenario, model)
@@ -149,8 +150,8 @@ class GeometricResponses:
         if len(self._known) > 500_000:  # some 100 MB
             self._known.clear()
         missing = set(keys).difference(self._known)
-        # Few new responses are asked for by served boards, which soon ask for the next steps, too: 16 of them at once
-        # take a third of the time.
+        # Served boards need few new responses at a time, and soon the next steps, too: computing 16 at once takes a
+        # third of the time.
         if len(missing) <= 100:
             step = len(self.scenario.tags) ** 2
             missing = {key + step * k for key in missing for k in range(16)}.difference(self._known)
@@ -190,9 +191,9 @@ class GeometricResponses:
         return rotation[:, :, 2]
 
     def _obstruction_gain(self, ends: Ends, side: int, spots: Floats, length: Floats) -> Floats:
-        """Return the relative field after obstacles and other bodies from the antennas of a side to spots (n, k, 3).
+        """Return the relative field after obstacles and other bodies from the antennas of one end to points (n, k, 3).
 
-        A tag's own body is part of its antenna's table.
+        The table of a tag's antenna includes its own body.
         """
         left = np.ones(length.shape)
         rows, to = np.repeat(np.arange(len(length)), length.shape[1]), spots.reshape(-1, 3)
@@ -207,7 +208,7 @@ class GeometricResponses:
         return left
 
     def _direct(self, ends: Ends) -> tuple[Floats, Complexes]:
-        """Return lengths and fields of the direct path around obstacles, and of that through them; (n, 2) each."""
+        """Return lengths and fields of the direct path around obstacles, and of the path through them; (n, 2) each."""
         scenario, distance, towards = self.scenario, ends.distance_m, ends.towards
         a, b = ends.antennas_m
         field = free_space_field(scenario, distance) * self._polarisation_match(ends, towards)
@@ -273,5 +274,5 @@ class GeometricResponses:
         size = np.sqrt(np.maximum((1 - along[0] ** 2) * (1 - along[1] ** 2), 0))
         match = (np.einsum("nj,nj->n", one, other) - along[0] * along[1]) / np.maximum(size, AXIAL)
         match = np.where(size < AXIAL, 1.0, match)
-        # Chosen: cross-polarised antennas are coupled by a tenth of the field, -20 dB.
+        # A judgement: cross-polarised antennas are coupled by a tenth of the field, -20 dB.
         return np.copysign(np.maximum(np.abs(match), 0.1), match)

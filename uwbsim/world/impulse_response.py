@@ -62,7 +62,7 @@ OWN_TAPS: Final = np.arange(1, 4)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Paths:
-    """p paths of n links: length less the straight line, in metres, and complex amplitude.
+    """p paths of n links: length minus the straight line, in metres, and complex amplitude.
 
     Shapes (n, p); an amplitude's square is a power in mW, its phase that of the carrier.
     """
@@ -75,9 +75,9 @@ class Paths:
 class PathsHeard:
     """The paths of a link for its impulse response: the power of the first path in dBm, and p paths, (p,) each.
 
-    `delay_s` are relative to the detected first path. Real `amplitude` are those of echoes after it, as fractions of
-    its own. Complex `amplitude` in roots of mW are those of all paths, from geometry, the first among them; some may
-    come before the one that the chip detects.
+    `delay_s` are relative to the detected first path. Real `amplitude` are the amplitudes of echoes after it, as
+    fractions of its amplitude. Complex `amplitude`, in roots of mW, are the amplitudes of all paths from geometry,
+    including the first; some may be before the path that the chip detects.
     """
 
     power_dbm: float
@@ -98,10 +98,10 @@ def peak_amplitude(power_dbm: float) -> float:
 def impulse_response(rng: np.random.Generator, stamp: int, paths: PathsHeard) -> tuple[int, tuple[int, ...]]:
     """Draw a response: index of the first path in thousandths of a tap, and 1016 magnitudes.
 
-    The index has the fraction of the receive `stamp` (ticks), 64 of which are a tap. Diffuse echoes are added to
+    The index has the fractional part of the receive `stamp` (ticks); 64 ticks are a tap. Diffuse echoes are added to
     `paths`, unless these are complex.
     """
-    # The chip puts the first path at 745, give or take a tap (DW1000 User Manual, 7.2.40.1).
+    # The chip places the first path at 745, within one tap (DW1000 User Manual, 7.2.40.1).
     index = int(INDEX_STEPS * (745.0 + rng.integers(-1, 2) + stamp % 64 / 64))
     # The chip reports the leading edge; the peak of the pulse follows it.
     peak = index / INDEX_STEPS + EDGE_TO_PEAK
@@ -109,8 +109,8 @@ def impulse_response(rng: np.random.Generator, stamp: int, paths: PathsHeard) ->
     if np.iscomplexobj(paths.amplitude):
         wave = _from_geometry(peak, paths)
         # Noise of real and imaginary part: 28 counts of a response at full gain, and a fraction of the strongest tap,
-        # as preambles do not correlate perfectly. By power, 265 responses of MILUV's boards have 0.0090 (at -82 dBm),
-        # 0.0091, 0.0113, 0.0122 and 0.0185 (at -93 dBm) of their strongest taps.
+        # because preambles do not correlate perfectly. By power, 265 responses of MILUV's boards have 0.0090 (at -82
+        # dBm), 0.0091, 0.0113, 0.0122 and 0.0185 (at -93 dBm) of their strongest taps.
         noise = float(np.hypot(28.0, 0.009 * np.abs(wave).max()))
     else:
         wave = _with_diffuse(rng, peak, paths)
@@ -136,7 +136,7 @@ def _with_diffuse(rng: np.random.Generator, peak: float, paths: PathsHeard) -> C
 
 
 def _from_geometry(peak: float, paths: PathsHeard) -> Complexes:
-    """Return the sum of all paths, scaled down where it exceeds the largest tap, as by the chip's gain control."""
+    """Return the sum of all paths, scaled down if it exceeds the largest tap, like the chip's gain control."""
     place = peak + paths.delay_s / TAP_S
     taps = np.floor(place)[:, None] + np.arange(-5, 6)
     pulses = np.exp(-(((taps - place[:, None]) / PULSE_TAPS) ** 2)) * (peak_amplitude(0.0) * paths.amplitude)[:, None]
@@ -162,8 +162,8 @@ def in_transfers(line: bytes) -> list[bytes]:
 class Detected:
     """Readings of n responses, (n,) each.
 
-    `excess_m` is the apparent length of the first path less the straight line, `power_dbm` its power by the chip's
-    formula, `total_dbm` that of the whole response, `noise_s` the standard deviation of its edge by noise.
+    `excess_m` is the apparent length of the first path minus the straight line, `power_dbm` its power by the chip's
+    formula, `total_dbm` the power of the whole response, `noise_s` the standard deviation of its edge by noise.
     """
 
     excess_m: Floats
@@ -178,8 +178,8 @@ def detect(paths: Paths, radio: Radio, noise_share: float) -> Detected:
     The threshold is the dynamic range of the radio below the strongest tap, or its sensitivity; `noise_share` is the
     standard deviation of noise as a fraction of it, 0 for stamps without noise. The first path is the first peak after
     the response exceeds the threshold. Its arrival is where its leading edge has half its height (0.52 in the median of
-    944 responses of MILUV's boards), plus the time from there to the peak of a single pulse. So the arrival of a single
-    path is exact at any power.
+    944 responses of MILUV's boards), plus the time from this point to the peak of a single pulse. So the arrival of a
+    single path is exact at any power.
     """
     parts = accumulate(paths)
     squares = parts[0] ** 2
@@ -187,16 +187,16 @@ def detect(paths: Paths, radio: Radio, noise_share: float) -> Detected:
     strongest = _height(squares.max(axis=1))
     least = np.log(10) / 20
     threshold = np.maximum(strongest - radio.dynamic_range_db * least, radio.sensitivity_dbm * least)
-    # A response below the sensitivity has a first path, too.
+    # A response below the sensitivity also has a first path.
     threshold = np.minimum(threshold, strongest - 0.5)
     peak, top = _first_peak(squares, np.argmax(squares >= np.exp(2 * threshold)[:, None], axis=1))
     edge, slope = _half_height(squares, peak, top)
-    # From half the height of a pulse alone to its peak.
+    # From half the height of a single pulse to its peak.
     arrival = edge + PULSE_TAPS * float(np.sqrt(np.log(2)))
     first = np.floor(arrival - EDGE_TO_PEAK + 1e-6).astype(np.int64)[:, None] + OWN_TAPS
     own = np.take_along_axis(squares, np.clip(first, 0, SEARCHED_TAPS - 1), axis=1).sum(axis=1) / _squares(OWN_TAPS)
     total = squares.sum(axis=1) / _squares(np.arange(-8, 9))
-    # Paths after the last tap count for the total power only.
+    # Paths after the last tap contribute only to the total power.
     late = paths.detour_m >= (SEARCHED_TAPS - BEFORE - EDGE_TO_PEAK) * TAP_M
     if np.any(late):
         total += np.sum(np.abs(np.where(late, paths.amplitude, 0)) ** 2, axis=1)

@@ -26,7 +26,7 @@ NEAREST_PATH_M: Final = 0.05
 """Least length of a path in its gain: the far-field formula does not hold closer to an antenna."""
 
 SHADOW_ORDERS: Final = np.arange(1, 4)
-"""Harmonics of azimuth in the shadowing of a tag by its body: smooth over some 60 degrees. Chosen."""
+"""Harmonics of azimuth in the shadowing of a tag by its body: smooth over some 60 degrees, a judgement."""
 
 
 def _dipole_db(sine: Floats) -> Floats:
@@ -41,8 +41,8 @@ ANTENNAS: Final[dict[str, Callable[[Floats], Floats]]] = {"isotropic": np.zeros_
 def harmonics(direction: Floats, degree: int) -> Floats:
     """Return the real spherical harmonics of degree 0 to `degree` at unit vectors (n, 3), (n, (degree + 1)^2).
 
-    Ordered by degree l, then by m from -l to l; negative m are those with the sine of azimuth. Their root mean square
-    over all directions is one.
+    Ordered by degree l, then by m from -l to l; negative m have the sine of azimuth. Their root mean square over all
+    directions is one.
     """
     azimuth = np.arctan2(direction[:, 1], direction[:, 0])
     height = np.clip(direction[:, 2], -1, 1)
@@ -66,7 +66,7 @@ def antenna_gain_db(scenario: Scenario, phases: Floats, tags: Ints, direction: F
     """Return the gains in dB of tags with indices (n,) towards unit vectors (n, 3) in their bodies' frames, (n,).
 
     The antenna stands along the body's z axis. Shadowing by the body is a smooth function of azimuth with standard
-    deviation `shadowing_db`; `phases` (tags, harmonics) are those of `shadowing_phases`.
+    deviation `shadowing_db`; `phases` (tags, harmonics) are from `shadowing_phases`.
     """
     radio = scenario.radio
     if isinstance(radio.antenna, AntennaTable):
@@ -111,7 +111,7 @@ def _group_delay_cm(model: GroupDelay, direction: Floats) -> Floats:
     azimuth = np.arctan2(direction[:, 1], direction[:, 0]) - np.radians(model.turned_deg)
     sine = np.clip(direction[:, 2], -1, 1)
     if isinstance(model, GroupDelayTable):
-        # The azimuth of a turned board may lie beyond the ends of the table, which are the same direction.
+        # The azimuth of a turned board may be beyond the ends of the table, which are the same direction.
         around = (np.degrees(azimuth) + 180) % 360 - 180
         table = _interpolator(model.azimuth_deg, model.elevation_deg, model.delay_cm)
         return np.asarray(table(np.column_stack([around, np.degrees(np.arcsin(sine))])))
@@ -123,7 +123,7 @@ def _group_delay_cm(model: GroupDelay, direction: Floats) -> Floats:
 
 
 def path_gain_db(radio: Radio, distance_m: Floats) -> Floats:
-    """Return first-path power over distance without antennas, in dBm, (n,)."""
+    """Return the first-path power at distances without antenna gains, in dBm, (n,)."""
     nearest = np.maximum(distance_m, NEAREST_PATH_M)
     return radio.first_path_at_1m_dbm - 10 * radio.path_loss_exponent * np.log10(nearest)
 
@@ -134,11 +134,11 @@ def lifted(power_dbm: Floats) -> Floats:
 
 
 SATURATION_SHARPNESS: Final = 1.5
-"""Fitted to the ICRA 2023 flights, half of whose readings end within 3 dB of their highest."""
+"""Fitted to the ICRA 2023 flights, in which half of the readings are within 3 dB of the highest."""
 
 
 def reported_dbm(radio: Radio, power_dbm: Floats) -> Floats:
-    """Return the first-path powers that receivers read, saturated if the radio has a saturation.
+    """Return the first-path powers read by receivers, saturated if the radio has a saturation.
 
     With lifted powers x of the path, y of the reading and z of saturation: y^-s = x^-s + z^-s, s being
     `SATURATION_SHARPNESS`.
@@ -156,9 +156,10 @@ def before_saturation_dbm(reading_dbm: Floats, saturation_dbm: float) -> tuple[F
 
 
 def reception_bias_s(radio: Radio, power_dbm: Floats, total_dbm: Floats | None = None) -> Floats:
-    """Return the bias of a receive stamp by power, in seconds: a spline over first-path, a table over total power.
+    """Return the bias of a receive stamp by power, in seconds: a spline over first-path power, a table over total
+    power.
 
-    Both receptions of a range have it, so the bias of a range is the mean of the curve's two values.
+    Both receptions of a range have this bias, so the bias of a range is the mean of the curve's two values.
     """
     if isinstance(radio.bias, BiasTable):
         order = np.argsort(radio.bias.power_dbm)
@@ -170,7 +171,7 @@ def reception_bias_s(radio: Radio, power_dbm: Floats, total_dbm: Floats | None =
 def reception_noise_s(radio: Radio, power_dbm: Floats) -> Floats:
     """Return the standard deviation of a receive stamp, in seconds: white noise and the sigma curve.
 
-    The curve gives the range's; a range has c sqrt(s^2/2 (1 + r + r^2)) (docs/theory.md).
+    The curve is the standard deviation of a range, c sqrt(s^2/2 (1 + r + r^2)) (docs/theory.md).
     """
     ratio = radio.sigma.reply_ratio if radio.sigma else 0.0
     factor = SPEED_OF_LIGHT * np.sqrt((1 + ratio + ratio**2) / 2)

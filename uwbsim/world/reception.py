@@ -1,7 +1,7 @@
 """Reception of frames: time of arrival, receive stamp, detection, and the readings that boards print.
 
 Simulated flights, served boards and passive listeners call `Medium.receive`. Comparisons of protocols need the
-distribution of stamps instead of a draw: they call `stamp_errors_s`, which `receive` uses, too.
+distribution of stamps instead of random values: they call `stamp_errors_s`, which `receive` also uses.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from uwbsim.world.world import SampledWorld, World
 class AntennaDelays:
     """Errors of stamps by the antenna delays of tags, by the tags' indices in the scenario.
 
-    `fixed` (tags, 2) are those of transmit and of receive stamps at the reference temperature and voltage, in seconds;
-    the delays of the tags in `variable` depend on both. A range grows by x where the tag's aggregate delay, transmit
-    less receive, falls by 2 x/c: 0.44 of that delays transmissions relative to their stamps, and 0.56 of it delays
-    receive stamps.
+    `fixed` (tags, 2) are the errors of transmit and receive stamps at the reference temperature and voltage, in
+    seconds; the delays of the tags in `variable` depend on both. A range increases by x if the tag's aggregate delay,
+    transmit minus receive, decreases by 2 x/c: 0.44 of this delays transmissions relative to their stamps, and 0.56
+    delays receive stamps.
     """
 
     scenario: Scenario
@@ -102,7 +102,7 @@ class Medium:
         A transmit stamp is the chip's counter at departure plus its register. `noise` is standard normal, (n,).
         """
         due = stamp * SUBTICKS
-        # The antenna delay shifts the instant by less than temperature and voltage change in.
+        # Temperature and voltage do not change within the antenna delay.
         now = self.clocks.when(sender, due) if self.delays.variable else due
         delay = self.delays.transmit_s(sender, now)
         early = noise * (self.scenario.radio.tx_noise_ps * 1e-12) * SUBTICKS_PER_SECOND - delay * SUBTICKS_PER_SECOND
@@ -125,14 +125,16 @@ class Medium:
         return (reading + shift + SUBTICKS // 2) // SUBTICKS, link
 
     def heard(self, power_dbm: Floats, fading: Floats | float = 0.0) -> Bools:
-        """Return which frames are above the sensitivity, after power noise; `fading` is standard normal."""
+        """Return which frames are above the sensitivity, with power noise; `fading` is standard normal."""
         radio = self.scenario.radio
         return np.asarray(power_dbm + fading * radio.power_noise_db >= radio.sensitivity_dbm)
 
     def readings(
         self, frames: Frames, power_dbm: Floats, power_noise: Floats, skew_noise: Floats
     ) -> tuple[Floats, Floats]:
-        """Return first-path power in dBm and relative skew in ppm as receivers print them; noises standard normal."""
+        """Return first-path power in dBm and relative skew in ppm as receivers print them; noises are
+        standard normal.
+        """
         radio, clocks, time = self.scenario.radio, self.clocks, frames.departure
         skew = (clocks.rate(frames.receiver, time) - clocks.rate(frames.sender, time)) * 1e6
         offsets = np.array([tag.power_offset_db for tag in self.scenario.tags])

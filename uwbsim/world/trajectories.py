@@ -46,7 +46,7 @@ def _quaternions(angles: Floats) -> Floats:
 def sample(
     motion: RandomFlight | Waypoints | Figure | Static | Carried | Recorded, duration_s: float, draw: Draw
 ) -> Trajectory:
-    """Return the trajectory of a body over [0, duration_s]; `draw` gives the streams of random trajectories.
+    """Return the trajectory of a body over [0, duration_s]; `draw` returns the streams of random trajectories.
 
     A longer duration continues the same flight.
     """
@@ -71,7 +71,7 @@ def _static(motion: Static, _duration_s: float, _draw: Draw) -> Trajectory:
 
 
 def _carried(motion: Carried, _duration_s: float, _draw: Draw) -> Trajectory:
-    # Each place twice, when the body comes and when it goes: from standstill to standstill.
+    # Each place twice, at arrival and departure: from standstill to standstill.
     places = np.repeat(np.array(motion.places_m), 2, axis=0)
     arrivals = np.arange(len(motion.places_m)) * (motion.stay_s + motion.carry_s)
     times = np.column_stack([arrivals, arrivals + motion.stay_s]).ravel()
@@ -124,7 +124,7 @@ def _figure(motion: Figure, _duration_s: float, _draw: Draw) -> Trajectory:
     def position(time_s: Floats) -> Floats:
         angle = 2 * np.pi * time_s / motion.period_s + np.radians(motion.phase_deg)
         sideways = np.sin(2 * angle) / 2 if motion.shape == "eight" else np.sin(angle)
-        # The height of a helix has a period of five rounds, that of other figures of one.
+        # The height of a helix has a period of five rounds, the height of other figures of one.
         slow = angle / 5 if motion.shape == "helix" else angle
         height = 0.5 * motion.climb_m * np.sin(slow)
         return np.asarray(centre + np.column_stack([radius * np.cos(angle), radius * sideways, height]))
@@ -148,8 +148,8 @@ def _random_flight(motion: RandomFlight, duration_s: float, draw: Draw) -> Traje
     lo, hi = np.array(motion.box_min_m), np.array(motion.box_max_m)
     # Two random points of a box lie about 0.38 of its diagonal apart.
     leg_s = 0.38 * float(np.linalg.norm(hi - lo)) / motion.speed_mps
-    # One control point a leg. A B-spline stays in the convex hull of its control points, hence in
-    # the box, and a cubic one has continuous acceleration.
+    # One control point per leg. A B-spline stays in the convex hull of its control points, hence in the box, and a
+    # cubic one has continuous acceleration.
     count = int(np.ceil(duration_s / leg_s)) + 8
     knots = (np.arange(count + 4, dtype=np.float64) - 5) * leg_s
     path = BSpline(knots, draw("position").uniform(lo, hi, (count, 3)), 3)
@@ -194,7 +194,7 @@ def _height(sensor: Height, rng: np.random.Generator, path: Trajectory, time_s: 
 
 def true_motion(path: Trajectory, time_s: Floats) -> tuple[Floats, Floats]:
     """Return angular velocity (n, 3) in rad/s and specific force (n, 3) in m/s^2, both in the axes of the body."""
-    # The error of positions is 1e-16, so that of accelerations over 2 ms is 1e-9.
+    # The rounding error of positions is 1e-16, so the error of accelerations over 2 ms is 1e-9.
     step_s = 1e-3
     before, after = (Rotation.from_quat(path.quaternion(time_s + sign * step_s)) for sign in (-1, 1))
     gyro = (before.inv() * after).as_rotvec() / (2 * step_s)

@@ -1,8 +1,8 @@
 """Positions of all tags, states of their pairs, and the links between them: exact, or interpolated from blocks.
 
-Pairs have states that last: fading, outages, and lasting reflections ("two-state" multipath). A state is constant
-between random instants, at which it is drawn again, so its autocorrelation is exp(-dt/life). Each property has a random
-stream named by its purpose and the two tags: a longer run continues a shorter one.
+Pairs have lasting states: fading, outages, and reflections ("two-state" multipath). A state is constant between random
+instants, at which it is drawn again, so its autocorrelation is exp(-dt/life). Each property has a random stream with
+the name of its purpose and the two tags, so a longer run continues a shorter one.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class PairStates:
         `life_s(ids, draw)` is the mean time between the instants of the pair with these tag ids, and
         `values(ids, draw, count)` draws its states, (rows, count).
         """
-        # Links are needed until a minute after the end of a run at most; beyond it the last state stays.
+        # Links are needed until at most a minute after the end of a run; after that the last state remains.
         count, span = len(scenario.tags), scenario.run.duration_s + 60.0
         pair, begins, drawn = np.zeros((count, count), dtype=np.int64), [], []
         for number, (a, b) in enumerate(combinations(range(count), 2)):
@@ -72,7 +72,7 @@ class PairStates:
     def at(self, places: tuple[Ints, Ints], time_s: Floats) -> Floats:
         """Return the states (rows, n) between tags (n,) at true times (n,); zero between a tag and itself.
 
-        They are the same in both directions.
+        States are the same in both directions.
         """
         inside = np.clip(time_s, 0, np.nextafter(self.span_s, 0))
         found = np.searchsorted(self.begin, self.pair[places] * self.span_s + inside, side="right") - 1
@@ -112,8 +112,8 @@ def pair_levels(scenario: Scenario) -> list[PairStates]:
 def reflected_states(scenario: Scenario, model: TwoStateMultipath) -> PairStates:
     """Draw the first paths of all pairs over a run, (4, states).
 
-    The rows are whether the first path is a reflection; its excess length in metres; and of reflections the loss in dB
-    relative to the direct path, and the delay in seconds of the strongest path after it.
+    The rows are: whether the first path is a reflection; its excess length in metres; for reflections the loss in dB
+    relative to the direct path; and the delay in seconds of the strongest path after it.
     """
 
     def life(ids: list[int], draw: Draw) -> float:
@@ -135,7 +135,7 @@ def reflected_states(scenario: Scenario, model: TwoStateMultipath) -> PairStates
 def pair_reflections(model: TwoStateMultipath, ids: list[int], rng: np.random.Generator) -> tuple[float, float, float]:
     """Return a pair's share of reflections, their life in seconds and their mean excess length in metres.
 
-    They are what the scenario says of the pair; otherwise the first two are drawn.
+    They are the scenario's values for the pair; otherwise the first two are random.
     """
     share, mean_m = model.share, model.mean_excess_m
     if model.share_std:
@@ -157,12 +157,12 @@ PIECE: Final = 4096
 class World:
     """Bodies on their trajectories, with tags on lever arms.
 
-    `phases` are those of the tags' shadowing, `states` the lasting reflections of pairs, `levels` their fading and
-    outages, `responses` the geometric responses; None or none where the scenario has none.
+    `phases` are the phases of the tags' shadowing, `states` the lasting reflections of pairs, `levels` their fading and
+    outages, `responses` the geometric responses; None or empty if the scenario has none.
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        """Draw all that is random; raises `ScenarioError` where bodies cannot keep their distance."""
+        """Draw all random values; raises `ScenarioError` if bodies cannot keep their distance."""
         model = scenario.radio.multipath
         self.scenario, self.trajectories = scenario, _trajectories(scenario)
         self.phases = shadowing_phases(scenario)
@@ -179,7 +179,7 @@ class World:
         return Link.concatenate([link_between(ends) for ends in self._pieces(initiator, target, time)])
 
     def paths(self, sender: Ints, receiver: Ints, time: Ints, detour_m: Floats) -> list[PathsHeard]:
-        """Return the paths of n links as impulse responses show them; `detour_m` are random detours of first paths."""
+        """Return the paths of n links for impulse responses; `detour_m` are random detours of first paths."""
         found: list[PathsHeard] = []
         for ends in self._pieces(sender, receiver, time):
             found += paths_heard(link_between(ends), ends, detour_m[len(found) : len(found) + PIECE])
@@ -217,7 +217,7 @@ class World:
         return position, rotation
 
     def motion_capture(self) -> Poses:
-        """Return the poses that motion capture writes over the run, with its rate, noise, latency and gaps."""
+        """Return the poses that motion capture records during the run, with its rate, noise, latency and gaps."""
         mocap, seed, parts = self.scenario.mocap, self.scenario.run.seed, []
         # A little longer than the run, so that the last exchange lies between two poses.
         count = int(np.ceil((self.scenario.run.duration_s + 0.05) * mocap.rate_hz)) + 2
@@ -230,7 +230,7 @@ class World:
         return Poses.concatenate(parts).in_time_order()
 
     def seen(self, name: str, time_ns: Ints, rng: np.random.Generator, gaps_s: Floats) -> Poses:
-        """Return the poses of a body that motion capture takes at times (n,), except in gaps with these starts."""
+        """Return the poses of a body that motion capture records at times (n,), except in gaps with these starts."""
         mocap, body = self.scenario.mocap, self.trajectories[name]
         time_s = np.asarray(time_ns * 1e-9, dtype=np.float64)
         position = body.position_m(time_s) + rng.normal(0, 1, (len(time_s), 3)) * mocap.position_noise_m
@@ -243,7 +243,7 @@ class World:
 
 
 def _trajectories(scenario: Scenario) -> dict[str, Trajectory]:
-    """Draw the trajectories in turn; one that comes too close to an earlier one is drawn again."""
+    """Draw the trajectories one by one; a trajectory that comes too close to an earlier one is drawn again."""
     seed, duration, least, tries = scenario.run.seed, scenario.run.duration_s, scenario.min_separation_m, 60
     time = np.arange(0, min(duration, 600.0) + 0.05, 0.05)
     found: dict[str, Trajectory] = {}
@@ -265,14 +265,14 @@ def _trajectories(scenario: Scenario) -> dict[str, Trajectory]:
 
 STEP_S: Final = 0.005
 STEPS: Final = 200
-"""Samples of a block, `STEP_S` apart. The error of linear interpolation is a (STEP_S)^2/8: 30 um or 0.01 ticks at
-10 m/s^2."""
+"""Number of samples of a block, `STEP_S` apart. The error of linear interpolation at an acceleration a is a
+(STEP_S)^2/8: 30 um or 0.01 ticks at 10 m/s^2."""
 
 
 class SampledWorld:
     """The links of a world for single frames in order of time, interpolated within blocks of `STEPS` samples.
 
-    An instant in another block than the last one computes that block.
+    A time in another block than the last one computes this block.
     """
 
     def __init__(self, world: World) -> None:

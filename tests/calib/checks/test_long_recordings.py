@@ -40,7 +40,7 @@ def path(flight, tmp_path_factory):
 
 def test_stretches_are_over_all_of_the_time_and_their_distances_are_those_of_all_poses(flight, path):
     with Recording.open(path) as recording:
-        looked = recording_view.looked_at(RecordedSource(recording))
+        looked = recording_view.select_part(RecordedSource(recording))
     x, every = looked.exchanges, flight.exchanges
     assert len(every) == 24_000
     assert len(x) == pytest.approx(EXAMINED_EXCHANGES, rel=0.02)
@@ -69,5 +69,5 @@ def test_poses_that_are_late_are_found_by_how_much(flight, tmp_path):
 def test_a_short_recording_is_looked_at_as_a_whole(path, monkeypatch):
     monkeypatch.setattr(recording_view, "EXAMINED_EXCHANGES", 24_000)
     with Recording.open(path) as recording:
-        assert len(recording_view.looked_at(RecordedSource(recording)).exchanges) == 24_000
+        assert len(recording_view.select_part(RecordedSource(recording)).exchanges) == 24_000
     assert examined_part(24_000) == ""

@@ -128,7 +128,7 @@ def test_single_sided_ranges_and_missing_ones_are_warned_of():
 
 
 def test_a_likelihood_that_leaves_a_pair_out_is_not_believed(monkeypatch):
-    found_by, r = known_distances.likeliest, ranges(2000)
+    found_by, r = known_distances.fit_likelihood, ranges(2000)
     assert fit(r).calibration.loss == "mixture"
 
     def lost(model, *words):
@@ -136,6 +136,6 @@ def test_a_likelihood_that_leaves_a_pair_out_is_not_believed(monkeypatch):
         # 75 cm in all ranges of a tag: farther from the robust start than reflections move a median.
         return replace(found, residuals=found.residuals + 0.75 * (model.ranges.initiator == 1))
 
-    monkeypatch.setattr(known_distances, "likeliest", lost)
+    monkeypatch.setattr(known_distances, "fit_likelihood", lost)
     assert fit(r).calibration.loss == "cauchy"
     assert any("treated all ranges of a pair as reflected" in warning for warning in fit(r, loss="mixture").warnings)

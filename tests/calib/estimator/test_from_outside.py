@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.worlds import CLEAN, make
-from calib.estimator.known_distances import likeliest, model_of, robust_fit
+from calib.estimator.known_distances import fit_likelihood, model_of, robust_fit
 from calib.estimator.optimize import maximize
 from calib.estimator.range_rows import RESIDUAL, Part
 from calib.estimator.rows import normal_terms
@@ -35,7 +35,7 @@ def warmed():
     warmer = 10 * np.sin(model.ranges.time_ns * 2e-9)
     error = model.ranges.raw_m - model.ranges.truth_m + PER_KELVIN_M * warmer
     pilot = robust_fit(model, error, "cauchy", None, ("delay", *model.curve_kinds()))
-    return model, error, warmer, likeliest(model, error, pilot)
+    return model, error, warmer, fit_likelihood(model, error, pilot)
 
 
 def climbed(warmed, *rows_of_others):

@@ -40,11 +40,11 @@ def test_what_a_fit_uses_of_the_data_is_given_back():
 
 
 @pytest.mark.slow
-def test_reflections_of_another_shape_are_in_the_intervals(monkeypatch):
-    shape = known_distances._of_another_shape
+def test_reflections_covariance_of_other_detours_are_in_the_intervals(monkeypatch):
+    shape = known_distances._covariance_of_other_detours
     traces = {}
     for added in (False, True):
-        monkeypatch.setattr(known_distances, "_of_another_shape", shape if added else lambda *_: 0.0)
+        monkeypatch.setattr(known_distances, "_covariance_of_other_detours", shape if added else lambda *_: 0.0)
         for share in (0.001, 0.3):
             traces[share, added] = np.trace(fitted(Recipe(share=(share, share), seconds=60)).covariances["delay"])
     few, many = (traces[share, True] - traces[share, False] for share in (0.001, 0.3))

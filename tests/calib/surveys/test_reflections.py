@@ -51,7 +51,7 @@ def linear():
 
 def test_the_search_and_the_weights_are_those_of_the_likelihood_written_out(linear):
     none, unlikely = linear
-    marks = none.searched()
+    marks = none.search()
     assert marks.any()
     here = unlikely(marks)
     # No change of two rows is likelier.

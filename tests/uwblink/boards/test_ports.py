@@ -11,7 +11,7 @@ from tests import processes
 from tests.boards import served
 from tests.errors import one_line
 from uwblink.boards.board import Board
-from uwblink.boards.ports import SerialPort, _explained
+from uwblink.boards.ports import SerialPort, _port_error
 from uwblink.boards.ranging_plan import RangingPlan, load_plan
 from uwblink.errors import PlanError, PortBusyError, PortError, PortLostError, PortMissingError, PortPermissionError
 from uwblink.recording.schema import Tag, load_places
@@ -43,7 +43,7 @@ def test_the_list_of_ports_as_json():
 
 def test_permission_denied_names_the_group(tmp_path):
     (tmp_path / "port").write_text("")
-    error = _explained(str(tmp_path / "port"), PermissionError(errno.EACCES, "Permission denied"))
+    error = _port_error(str(tmp_path / "port"), PermissionError(errno.EACCES, "Permission denied"))
     assert isinstance(error, PortPermissionError)
     assert f"join the group {(tmp_path / 'port').group()}" in str(error)
 
