@@ -249,6 +249,16 @@ def test_ranges_without_stamps_with_total_powers_and_places(tmp_path, unit, scal
     assert ((bodies == "tag8").sum(), (bodies == "tag7").sum()) == (1, 30)
 
 
+@pytest.mark.parametrize(("column", "other"), [("range_m", "true distances"), ("gt_range_m", "ranges")])
+def test_the_column_in_another_unit_is_named_with_its_line_of_the_map(tmp_path, column, other):
+    rows = [{"from_id": 7, "to_id": 8, "range_m": 2.3 + 0.1 * k, "gt_range_m": 2 + 0.1 * k} for k in range(30)]
+    scaled = [row | {column: 1000 * row[column]} for row in rows]
+    with pytest.raises(ImportTableError, match=f"in mm according to the {other}.* write units.{column} = 'mm'"):
+        read_rows(tmp_path, scaled)
+    found = read_rows(tmp_path, scaled, f"[units]\n{column} = 'mm'\n").exchanges
+    np.testing.assert_allclose(found.range_m - found.truth_m, 0.3, atol=1e-6)
+
+
 def as_messages(rows, third="target"):
     found = []
     for k, row in enumerate(rows):
