@@ -300,7 +300,7 @@ SENTENCES = {
     "scale": "ranges grow with the distance by {size} too {way} over the recorded distances, which changes {worst}; "
     "check scale, unit and lever arms of the true distances",
     "late": "ranges change by {size} with the speed at which true distances change (root mean square): the times of "
-    "motion capture and ranges differ; check the clocks (`calib doctor` states the difference)",
+    "true distances and ranges differ; check the clocks (`calib doctor` states the difference where there are poses)",
 }
 """Sentences about findings, by their kinds, or by the names of errors that all ranges share."""
 
