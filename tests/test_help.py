@@ -74,6 +74,30 @@ def test_help_fits_80_columns_loses_no_word_and_has_examples_that_parse(words, c
 
 
 @pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("calib fit", "calib fit: missing argument 'recordings'; see 'calib fit --help'"),
+        ("calib fit f.uwb", "calib fit: missing option '-o' / '--output'; see 'calib fit --help'"),
+        ("calib fit f.uwb -o", "option '-o' requires an argument"),
+        ("calib doctor f.uwb --of", "calib doctor: no such option: --of"),
+        ("uwblink show a b", "uwblink show: got unexpected extra argument(s) (b)"),
+        ("uwblink import foo", "uwblink import: no such command 'foo'; see 'uwblink import --help'"),
+        ("uwblink replay f.uwb --speed 0", "uwblink replay: invalid value for '--speed'"),
+        ("uwbsim nonsense", "uwbsim: no such command 'nonsense'; see 'uwbsim --help'"),
+    ],
+)
+def test_wrong_words_are_answered_in_one_line(words, said):
+    assert processes.refuse(*words.split()).startswith(f"error: {said}")
+
+
+@pytest.mark.parametrize("words", ["calib", "uwblink import", "calib plan"])
+def test_a_group_alone_prints_its_help(words):
+    ended = processes.run(*words.split())
+    assert (ended.returncode, ended.stderr) == (2, "")
+    assert "Examples:" in ended.stdout or "Usage: calib" in ended.stdout
+
+
+@pytest.mark.parametrize(
     ("words", "new"),
     [
         ("calib sample --anchors", "--anchors is now --with-anchors"),

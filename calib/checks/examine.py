@@ -183,9 +183,14 @@ CHECKS: Final = (
     ),
     Check(
         "geometry",
-        "Do ranges agree better with poses that are more than 30 ms earlier or later?",
-        "log of the ratio of spreads before and after the shift", OVER_STRETCHES,
-        {"pose time offset": "shift the poses: uwblink poses ... --offset {shift}"},
+        "Do ranges agree better with poses or true distances that are more than 30 ms earlier or later?",
+        "log of the ratio of spreads before and after the shift; without poses the slope of errors over speeds",
+        f"{OVER_STRETCHES}; {OVER_BLOCKS}",
+        {
+            "pose time offset": "shift the poses: uwblink poses ... --offset {shift}",
+            "time offset of true distances": "add {shift} s to the clock of the system that measured the true "
+            "distances, and import again",
+        },
         geometry.pose_clock,
     ),
     Check(

@@ -123,7 +123,8 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
         yield of_tags("decibels", louder_m[:, None] / size)
     forth = np.where(ranges.initiator < ranges.target, 1.0, -1.0)
     yield of_tags("skew", forth[:, None] * [1.0, -1.0])
-    shared, reach = distance_speeds(model), float(np.ptp(ranges.truth_m))
+    speeds, reach = distance_speeds(model), float(np.ptp(ranges.truth_m))
+    shared = {"late": speeds / _root_mean_square(speeds)} if speeds.any() else {}
     if beside_curve and reach > 0:
         shared = {"scale": (ranges.truth_m - float(np.median(ranges.truth_m))) / reach} | shared
     if shared:
@@ -198,11 +199,8 @@ def errors_of_readings(model: RangeModel, louder_m: Floats) -> Floats | None:
     return np.asarray(missing / max(_root_mean_square(missing), 1e-12))
 
 
-def distance_speeds(model: RangeModel) -> dict[str, Floats]:
-    """Return the rate of change of the true distance of each range (n,), divided by its root mean square.
-
-    Speeds are computed from neighbouring ranges of each pair; None if no distance changes.
-    """
+def distance_speeds(model: RangeModel) -> Floats:
+    """Return the rate of change of the true distance of each range (n,), in m/s, from neighbouring ranges of its pair."""
     ranges, pair = model.ranges, model.pairs.number
     order = np.argsort(pair, kind="stable")
     time_s, truth_m = ranges.time_ns[order] * 1e-9, ranges.truth_m[order]
@@ -213,8 +211,7 @@ def distance_speeds(model: RangeModel) -> dict[str, Floats]:
     run, way = (np.convolve(np.where(near, np.diff(one), 0.0), [1.0, 1.0]) for one in (time_s, truth_m))
     speeds = np.empty(len(order))
     speeds[order] = way / np.where(run > 0, run, 1.0)
-    size = _root_mean_square(speeds)
-    return {"late": speeds / size} if size > 0 else {}
+    return speeds
 
 
 def _root_mean_square(values: Floats) -> float:
@@ -303,7 +300,7 @@ SENTENCES = {
     "scale": "ranges grow with the distance by {size} too {way} over the recorded distances, which changes {worst}; "
     "check scale, unit and lever arms of the true distances",
     "late": "ranges change by {size} with the speed at which true distances change (root mean square): the times of "
-    "motion capture and ranges differ; check the clocks (`calib doctor` states the difference)",
+    "true distances and ranges differ; check the clocks (`calib doctor` states the difference)",
 }
 """Sentences about findings, by their kinds, or by the names of errors that all ranges share."""
 

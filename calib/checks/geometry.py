@@ -27,13 +27,24 @@ from uwblink.recording.distances import antennas_m, distances_m, find_offset, si
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import names_in
 
+CLOCKS_S: Final = 0.03
+"""Host times of ranges are as late as USB makes them, and poses as a camera's exposure and network."""
+
 
 def pose_clock(view: RecordingView) -> Iterator[Candidate]:
-    """Find poses whose clock is off by up to a few seconds."""
-    fit = view.quick_fit
-    # If poses are late, by less than the time of a turn, errors of ranges are proportional to the speeds of distances.
-    follow = [fit.offset(speeds)[1] for speeds in distance_speeds(fit.model).values()] if fit else [0.0]
-    if not len(view.poses) or min(follow, default=1.0) > BUDGET:
+    """Find poses whose clock is off by up to a few seconds, and true distances of another time."""
+    fit, posed = view.quick_fit, len(view.poses) > 0
+    late_s, p_value = 0.0, 0.0 if posed else 1.0
+    # If true distances are late, by less than the time of a turn, errors are proportional to the speeds of distances.
+    if fit:
+        speeds, p_value = distance_speeds(fit.model), 1.0
+        if speeds.any():
+            late_s, p_value, _ = fit.offset(speeds, tolerance=0.0 if posed else CLOCKS_S)
+    if not posed:
+        way = "later" if late_s < 0 else "earlier"
+        evidence = f"ranges differ from the true distances as if these were those {abs(late_s):.2f} s {way}"
+        yield Candidate("time offset of true distances", evidence, p_value, words={"shift": f"{-late_s:+.2f}"})
+    if not posed or p_value > BUDGET:
         return
     # The offset is found by a search, because motion over a second is not linear.
     try:
@@ -41,8 +52,7 @@ def pose_clock(view: RecordingView) -> Iterator[Candidate]:
     except ImportTableError:
         return
     shift_s, e = offset_ns * 1e-9, view.exchanges
-    # Host times of ranges are late by USB, poses by exposure and network of the cameras.
-    if abs(shift_s) > 0.03:
+    if abs(shift_s) > CLOCKS_S:
         moved = distances_m(view.poses, view.tags, e.initiator, e.target, e.time_ns - offset_ns)
         evidence = f"with the poses {shift_s:+.3f} s later"
         yield _with_spreads(view, Candidate("pose time offset", evidence, words={"shift": f"{shift_s:.3f}"}), moved)

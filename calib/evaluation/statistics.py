@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, Final
@@ -30,11 +30,6 @@ CORRECTION_STAGES: Final = {"raw": "raw_m", "delays": "delay_corrected_m", "full
 NOMINAL: Final = {"50": 0.6744897501960817, "68": 1.0, "90": 1.6448536269514722, "95": TWO_SIDED_95,
                   "99": 2.5758293035489004}  # fmt: skip
 """Two-sided bounds of a standard normal distribution, by per cent."""
-
-TITLE: Final = (
-    "Range errors in cm: mean, median and robust standard deviation, raw, with delays and fully corrected; per cent "
-    "that chi-square rejects at 95 %; standard deviation over the total sigma; per cent within their 95 % interval"
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,8 +136,8 @@ class Evaluation:
         return as_html(TITLE, self._rows()) + notebook_image(draw, "errors by pair, raw and corrected")
 
     def _rows(self) -> list[list[str]]:
-        above = ["", "", "raw", "", "", "delay", "", "", "full", "", "", "chi2", "total", "in"]
-        head = ["pair", "n", *3 * ["mean", "med.", "rob."], "out%", "z std", "95%"]
+        above = ["", "", "raw", "", "", "delay", "", "", "full", "", "", *(column[0] for column in COLUMNS)]
+        head = ["pair", "n", *3 * ["mean", "med.", "rob."], *(column[1] for column in COLUMNS)]
         return [
             above,
             head,
@@ -174,9 +169,24 @@ def stage_cells(group: ErrorStatistics) -> list[str]:
     return [str(group.raw.n), *(f"{100 * error:.1f}" for error in errors_m)]
 
 
+COLUMNS: Final[tuple[tuple[str, str, str, Callable[[ErrorStatistics], str]], ...]] = (
+    ("chi2", "out%", "per cent that chi-square rejects at 95 %", lambda group: f"{100 * group.rejected:.1f}"),
+    ("total", "z std", "standard deviation over the total sigma", lambda group: f"{group.total_std:.2f}"),
+    ("in", "95%", "per cent within their 95 % interval", lambda group: f"{100 * group.inside_95:.1f}"),
+)
+"""The columns of the table after those of the stages: two lines of its header, words for its title, and the cell of a
+group. A new statistic is a field of `ErrorStatistics`, its value in `_group`, and a row here."""
+
+TITLE: Final = "; ".join(
+    [
+        "Range errors in cm: mean, median and robust standard deviation, raw, with delays and fully corrected",
+        *(column[2] for column in COLUMNS),
+    ]
+)
+
+
 def _cells(group: ErrorStatistics) -> list[str]:
-    rejected, inside = (f"{100 * share:.1f}" for share in (group.rejected, group.inside_95))
-    cells = [*stage_cells(group), rejected, f"{group.total_std:.2f}", inside]
+    cells = [*stage_cells(group), *(column[3](group) for column in COLUMNS)]
     return ["-" if "nan" in cell else cell for cell in cells]
 
 

@@ -30,9 +30,6 @@ LIMITS: Final = {resource.RLIMIT_DATA: 2_000_000_000, resource.RLIMIT_CPU: 20}
 
 LONGEST_WAIT_S: Final = 300.0
 TOLD_EVERY: Final = 1000
-USAGE: Final = ("Usage:", "─ Error ─")
-"""What a mistake in options is answered with: how it would be right, in a few lines."""
-
 OPTIONS_SHARE: Final = 0.1
 """Share of cases in which an option is damaged and not the file."""
 
@@ -102,7 +99,7 @@ def judge(ended: subprocess.CompletedProcess[str], written: list[Path]) -> str:
     if ended.returncode not in (0, 1, 2):
         return f"status {ended.returncode}"
     said = [line for line in ended.stderr.splitlines() if not line.startswith("warning: ")]
-    if ended.returncode == 2 and not any(usage in ended.stderr for usage in USAGE):
+    if ended.returncode == 2:
         if len(said) != 1 or not said[0].startswith("error: "):
             return f"an error of {len(said)} lines: {' / '.join(said)[:200]!r}"
         if not said[0].isprintable():

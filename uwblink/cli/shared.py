@@ -44,6 +44,9 @@ from uwblink.settings import flags_of
 FLAGS: Final = {"map_file": "--map", "tags_from": "--tags", "duration_s": "--duration"}
 """Flags of parameters of uwblink that differ from the parameter's name with dashes."""
 
+USAGE_ERROR: Any = typer.BadParameter.__base__
+"""What Typer raises for wrong words of a command line; it has no public name."""
+
 Flags = Mapping[str, str]
 """Flags by parameter, where they differ from the parameter's name with dashes."""
 
@@ -328,13 +331,14 @@ def run(
     status = 0
     with interrupts(at_once=True) as interrupted, _plain_warnings():
         try:
-            app(args=list(sys.argv[1:] if arguments is None else arguments))
+            status = app(args=list(sys.argv[1:] if arguments is None else arguments), standalone_mode=False) or 0
         except (Exception, KeyboardInterrupt, SystemExit) as error:
             if not interrupted():
                 text = _message(error, mistakes)
                 if text is None:
                     raise
-                typer.echo(f"error: {one_line(with_flags(text, FLAGS | dict(flags)))}", err=True)
+                if text:
+                    typer.echo(f"error: {one_line(with_flags(text, FLAGS | dict(flags)))}", err=True)
                 status = next((number for kind, number in (statuses or {}).items() if isinstance(error, kind)), 2)
     if interrupted():
         # A library may have turned the interrupt into an error of its own, or swallowed it.
@@ -344,9 +348,16 @@ def run(
 
 
 def _message(error: BaseException, mistakes: tuple[type[Exception], ...]) -> str | None:
-    """Return the message for an error caused by input or by the machine; None for an error of the program."""
+    """Return the message for an error caused by input or by the machine; None for an error of the program.
+
+    It is empty where a command without words has printed its help.
+    """
     if isinstance(error, mistakes):
         return str(error)
+    if isinstance(error, USAGE_ERROR):
+        said, where = error.format_message().rstrip("."), getattr(error.ctx, "command_path", "")
+        said = said[:1].lower() + said[1:]
+        return f"{where}: {said}; see '{where} --help'" if said and where else said
     if isinstance(error, RuntimeWarning):
         return f"numbers are too large for the computation ({error}); nothing was written"
     if isinstance(error, OSError):

@@ -300,12 +300,15 @@ def _choose(
         raise ArgumentError("found no files, expected a path or several", parameter="source")
     if importer is not None and importer not in IMPORTERS:
         raise ArgumentError(f"importer: found {importer!r:.40}, allowed: {', '.join(IMPORTERS)}")
-    rows, ending = (IMPORTERS.values() if importer is None else [IMPORTERS[importer]]), sources[0].name.lower()
-    if (row := next((row for row in rows if importer or ending.endswith(row.suffixes)), None)) is None:
-        known = ", ".join(suffix for row in rows for suffix in row.suffixes)
+    ending = sources[0].name.lower()
+    # Of several the longest ending decides, and of equal ones the first row.
+    fitting = {len(one): row for row in [*IMPORTERS.values()][::-1] for one in row.suffixes if ending.endswith(one)}
+    if importer is None and not fitting:
+        known = ", ".join(suffix for row in IMPORTERS.values() for suffix in row.suffixes)
         raise ImportTableError(
             f"{sources[0]}: no importer for this kind of file; the known ones are {known}; or choose one with importer="
         )
+    row = fitting[max(fitting)] if importer is None else IMPORTERS[importer]
     if map_file is not None and row.map_help is None:
         raise ArgumentError(f"importer {row.name!r} uses none", parameter="map_file")
     if len(sources) > 1 and not row.several:

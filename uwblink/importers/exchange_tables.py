@@ -272,7 +272,8 @@ def _layout(staging: Staging) -> str:
     for layout, names in needed.items():
         if all(map(has, names)):
             return layout
-    raise staging.tables[0].missing(staging.column_map.header(next(name for name in STAMPS if not has(name))))
+    lacking = next(name for name in STAMPS if not has(name)) if any(map(has, STAMPS)) else "range_m"
+    raise staging.tables[0].missing(staging.column_map.header(lacking))
 
 
 def _poses(rows: StagedRows, bodies: Mapping[int, str]) -> Iterator[Poses]:

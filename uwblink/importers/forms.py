@@ -47,6 +47,7 @@ WORDS: Final = {
     ),
     "range": r"(range|dist|distance|abstand|distanz|entfernung|tof|time_?of_?flight)",
     "difference": r"(\b|_)(tdoa|dtoa)|(range|dist(ance)?)_?diff|\bdifference",
+    "measured": r"(measured?|gemessene?r?)",
     "made": r"(raw|filt(er)?(ered)?|corrected|corr|kalman|smooth(ed)?)",
     "true": (
         r"(gt|true|truth|ground_?truth|ref|reference|nominal|mocap|vicon|actual|tape(_?measured?)?|"
@@ -55,7 +56,7 @@ WORDS: Final = {
     "fpp": (
         r"(fpp?|(fp|first_?path)_?(power|pwr|rssi|level|leistung)|first_?path|(rssi|power|leistung)_?(fp|first_?path))"
     ),
-    "rxp": r"(rxp|rx_?(power|pwr|level)|rssi|total_?power|pr)",
+    "rxp": r"(rxp|rx_?(power|pwr|level|dbm)|rssi|total_?power|pr)",
     "skew": r"(skew|cfo|carrier|clock_?offset)",
     "sts": r"sts(_?(q|qual|quality))?(_?(idx|index))?",
     "temperature": r"(temp(eratur(e)?)?|t_?celsius)(_?(deg_?)?c(elsius)?)?",
@@ -104,7 +105,7 @@ PATTERNS: Final = {
     "sts1": r"{sts}_?1",
     "sts2": r"{sts}_?2?",
     "gt_range_m": r"{true}_?{range}?|{range}_?{true}",
-    "range_m": r"({made}_?|device_?|measured?_?|uwb_?|est(imated)?_?)?{range}(_?{made})?|measured",
+    "range_m": r"({made}_?|device_?|{measured}_?|uwb_?|est(imated)?_?)?{range}(_?({made}|{measured}))?|{measured}",
     "sequence": r"(seq|sequence|exchange|laufnummer)(_?(no|num|nr|number|id))?",
     "message": r"(msg|message|frame|nachricht)(_?(no|num|nr|number|type|id))?",
     "from_temperature_c": (

@@ -295,7 +295,8 @@ def _proposal(
     lacking = [name for name in needed if name not in cells or name in words]
     lacking += ["message"] if layout == "messages" and "message" in words & cells.keys() else []
     unplaced = [name for name in POSITIONS if name not in columns]
-    used = {*columns.values(), *(header for keys in registers.values() for header in keys.values())}
+    used = {header for name, header in columns.items() if name not in foreign}
+    used |= {header for keys in registers.values() for header in keys.values()}
     left = [json.dumps(name) for name in names if name not in used and not form.line and not form.wide]
     remarks = {
         why: layout == "nothing",
@@ -307,7 +308,9 @@ def _proposal(
     named: Entries = {
         name: (header, "") for name, header in columns.items() if name not in foreign and name not in given
     }
-    if layout == "ranges" and "range_m" in named and (others := _kinds_of_range(columns["range_m"], names)):
+    if layout == "nothing" and not {*STAMPS} & cells.keys():
+        named["range_m"] = (ASKED, "write the column of the ranges; or delete this line, and name those of stamps")
+    elif layout == "ranges" and "range_m" in named and (others := _kinds_of_range(columns["range_m"], names)):
         named["range_m"] = (
             ASKED,
             f"write the column that the device measured: {' or '.join(json.dumps(one) for one in others)}",

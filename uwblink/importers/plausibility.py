@@ -365,8 +365,10 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
         else {"ranges": lambda f: raw_m - f * ranges, "true distances": lambda f: raw_m - f * true}
     )
     if found := other_unit(errors, "ranges"):
-        beside = "the others" if raw_m is None else "its stamps"
+        lengths, unit = found.split(" are in ")
+        column, other = ("range_m", "true distances") if lengths == "ranges" else ("gt_range_m", "ranges")
         raise ImportTableError(
-            f"{path}: {found} by {beside}, and in {column_map.units.get('distance', 'm')} by the map; "
-            'units.distance is for all of them, and [units] range_m = "mm" for one column'
+            f"{path}: {found} according to the {other if raw_m is None else 'stamps'}, and in "
+            f"{column_map.unit_of(column) or 'm'} according to the map; write units.{column} = {unit!r} in the map, "
+            f"or units.distance for both"
         )

@@ -316,12 +316,10 @@ def register_channel_effect(name: str, effect: ChannelEffect) -> None:
     same flight. It applies to flights, served boards, passive listeners, and predictions and comparisons of protocols.
     Raises `ParameterError` for a name that is taken.
 
-    >>> from dataclasses import replace
     >>> import uwbsim
     >>> from uwbsim.world.channel import CHANNEL_EFFECTS
     >>> def rain(link, ends):
-    ...     loss_db = 0.2 * link.distance_m
-    ...     return replace(link, power_dbm=link.power_dbm - loss_db, total_dbm=link.total_dbm - loss_db)
+    ...     return link.weaker(0.2 * link.distance_m)
     >>> uwbsim.register_channel_effect("rain", rain)
     >>> [*CHANNEL_EFFECTS][-3:]
     ['fading and outages', 'group delays', 'rain']

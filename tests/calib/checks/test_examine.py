@@ -14,6 +14,7 @@ import uwbsim
 from benchmarks import doctor as planted
 from benchmarks.flights import LIGHT, Plan, fly
 from uwblink import Contents
+from uwblink.recording.distances import distances_m
 
 pytestmark = pytest.mark.slow
 
@@ -85,6 +86,17 @@ def late_poses(by_ns):
     return lambda f, _: replace(f, poses=replace(f.poses, time_ns=f.poses.time_ns + by_ns))
 
 
+def late_truths(by_ns):
+    """True distances in the table, of a time that is later by so much, and no poses."""
+
+    def plant(f, _):
+        e = f.exchanges
+        truth_m = distances_m(f.poses, f.tags, e.initiator, e.target, e.time_ns + by_ns)
+        return replace(f, exchanges=replace(e, truth_m=truth_m), poses=f.poses[:0])
+
+    return plant
+
+
 def simulated(*settings):
     return partial(planted.simulated, settings=settings)
 
@@ -140,6 +152,8 @@ UNREAD = "single-sided without carrier readings"
         (SHORT, partial(planted.frozen_poses, bodies=3), "frozen poses", "drone1, drone2, drone3"),
         (SHORT, columns(lambda e: {"rx2": e.rx2 // 10**7 * 10**7}), "impossible stamps", "of 3200"),
         (SHORT, late_poses(400_000_000), "pose time offset", "--offset -0.4|--offset -0.39"),
+        (SHORT, late_truths(400_000_000), "time offset of true distances", r"0\.[34]\d s later; add \+0\.[34]\d s"),
+        (SHORT, late_truths(-200_000_000), "time offset of true distances", r"0\.[12]\d s earlier; add -0\.[12]\d s"),
         (BRIEF, late_poses(LATE_NS), "no true distances", ""),
         (ANCHORS, some(lambda e: (e.initiator == 10) & (e.target == 100)), "too few pairs", "tag 10 and tag 100"),
         (SHORT, planted.still, "static data", ""),
@@ -170,6 +184,7 @@ def test_the_fault_is_named_and_nothing_else(plan, plant, fault, told):
     ("plan", "plant", "expected"),
     [
         (replace(SHORT, protocol="ds-alt"), planted.nothing, []),
+        (SHORT, late_truths(10_000_000), []),
         (replace(SHORT, protocol="ss-cfo"), planted.nothing, []),
         (ANCHORS, planted.nothing, []),
         (replace(SHORT, per_second=7, share=0.0), planted.nothing, []),

@@ -1,69 +1,51 @@
 """The estimator by what a contributor writes: an unknown, a part and a kind of row of one's own, and an oracle."""
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from benchmarks.worlds import CLEAN, make
-from calib.estimator.known_distances import fit_likelihood, model_of, robust_fit
-from calib.estimator.optimize import maximize
-from calib.estimator.range_rows import RESIDUAL, Part
-from calib.estimator.rows import normal_terms
-from calib.estimator.unknowns import Prior, Priors, Unknown
+from calib.estimator.known_distances import model_of, robust_fit
 from calib.settings import FitSettings
+from tests import pages
 
 PER_KELVIN_M = 0.004
 
 
-@dataclass(frozen=True)
-class Thermostat:
-    """A kind of row: what a data sheet says of an unknown."""
-
-    value: float
-    std: float
-    column: int
-
-    def terms(self, x):
-        yield normal_terms(np.array([self.value - x[self.column]]), np.array([self.std]), np.ones((1, 1)),
-                           np.array([[self.column]]))  # fmt: skip
+EXAMPLE = next(b.code for b in pages.blocks(pages.ROOT / "CONTRIBUTING.md") if "class DataSheet" in b.code)
 
 
 @pytest.fixture(scope="module")
-def warmed():
-    model = model_of(make(CLEAN["short, 30 s"], 12_001).ranges, FitSettings())
-    warmer = 10 * np.sin(model.ranges.time_ns * 2e-9)
-    error = model.ranges.raw_m - model.ranges.truth_m + PER_KELVIN_M * warmer
-    pilot = robust_fit(model, error, "cauchy", None, ("delay", *model.curve_kinds()))
-    return model, error, warmer, fit_likelihood(model, error, pilot)
+def climbed():
+    """A function that runs the example of CONTRIBUTING.md with a data sheet: the slope found, and its deviation."""
+    cold = make(CLEAN["short, 30 s"], 12_001).ranges
+
+    def temperature_at(time_ns):
+        return 10 * np.sin(time_ns * 2e-9)
+
+    warm = replace(cold, raw_m=cold.raw_m + PER_KELVIN_M * temperature_at(cold.time_ns))
+
+    def climb(slope, slope_std):
+        names = {"__name__": "example", "ranges": warm, "temperature_at": temperature_at}
+        names |= {"slope": slope, "slope_std": slope_std}
+        exec(EXAMPLE, names)  # noqa: S102 - the page is our own
+        found, at = names["found"], names["layout"].where["warmth"].start
+        assert found.success
+        return found.of("warmth")[0], float(np.sqrt(found.covariance[at, at]))
+
+    return climb
 
 
-def climbed(warmed, *rows_of_others):
-    model, error, warmer, start = warmed
-    mixture, unknowns, parts = model.error_model(start.residuals)
-    warmth = Unknown(kind="warmth", names=("m/K",), start=np.zeros(1), priors=(Prior.of_deviation(0.02),))
-    part = Part(parameter=RESIDUAL, kind="warmth", columns=np.zeros((len(error), 1), np.int64), values=-warmer[:, None])
-    layout, rows = model.build(error, mixture, [*unknowns, warmth], [*parts, part])
-    x = layout.start()
-    for kind, where in start.optimum.layout.where.items():
-        x[layout.where[kind]] = start.optimum.x[where]
-    others = [make_row(layout.where["warmth"].start) for make_row in rows_of_others]
-    asked = layout.indices(["warmth", *(block.kind for block in model.unknowns)])
-    found = maximize([rows, *model.gauge_rows(layout), *others], Priors(layout), x, asked=asked)
-    assert found.success
-    at = layout.where["warmth"].start
-    return found.of("warmth")[0], float(np.sqrt(found.covariance[at, at]))
-
-
-def test_one_more_unknown_is_one_unknown_and_one_part(warmed):
-    value, std = climbed(warmed)
+def test_one_more_unknown_is_one_unknown_and_one_part(climbed):
+    value, std = climbed(0.0, 1e6)
     assert std < 0.0003
     assert value == pytest.approx(PER_KELVIN_M, abs=4 * std)
 
 
-def test_one_more_kind_of_row_is_one_class(warmed):
-    alone, std = climbed(warmed)
-    value, both = climbed(warmed, lambda column: Thermostat(0.003, std, column))
+def test_one_more_kind_of_row_is_one_class(climbed):
+    alone, std = climbed(0.0, 1e6)
+    value, both = climbed(0.003, std)
     # As well known from the sheet as from ranges: halfway, and better by the root of two.
     assert value == pytest.approx((alone + 0.003) / 2, abs=0.2 * std)
     assert both == pytest.approx(std / np.sqrt(2), rel=0.1)

@@ -8,6 +8,7 @@ from scipy.stats import norm
 
 import calib
 from calib.data.ranges import Ranges, concatenate
+from calib.evaluation import statistics
 from calib.evaluation.statistics import evaluate, split_error
 from calib.figures import errors_by_pair
 from tests import processes
@@ -101,6 +102,17 @@ def test_a_figure_has_the_errors_of_each_pair_and_of_many_pairs_the_farthest():
     groups = {f"1-{k}": replace(found.overall, raw=replace(found.overall.raw, median_m=k)) for k in range(2, 30)}
     names = [text.get_text() for text in errors_by_pair(7.0, replace(found, pairs=groups)).axes[0].get_xticklabels()]
     assert names == [f"1-{k}" for k in range(6, 30)]
+
+
+def test_one_more_column_is_one_row(monkeypatch):
+    row = ("full", "95 % |e|", "quantile of absolute errors", lambda group: f"{group.full.abs95_m:.3f}")
+    monkeypatch.setattr(statistics, "COLUMNS", (*statistics.COLUMNS, row))
+    flight = calib.load_ranges(calib.sample_flight())
+    found = calib.evaluate(flight, calib.fit(flight))
+    _, above, head, *rows = repr(found).splitlines()
+    assert above.endswith("in     full")
+    assert head.endswith("95% 95 % |e|")
+    assert rows[-1].endswith(f" {found.overall.full.abs95_m:.3f}")
 
 
 # A fit judged on a part of its own ranges, which a second fit has not seen.

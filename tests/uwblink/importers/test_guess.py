@@ -278,8 +278,15 @@ DRAWN = np.random.default_rng(0).random((60, 4))
             ("stamps",),
             "",
         ),
+        ([{"src": 1, "dst": 2, "rx": 3, "wert": 3.1}] * 30, False, ("range_m",), '# not used: "rx", "wert"'),
+        (
+            [{"Sender": 1, "Empfänger": 2, "Abstand gemessen": 3.1, "Referenz": 3.0, "RX dBm": -80}] * 30,
+            True,
+            (),
+            'rxp2 = "RX dBm"\ngt_range_m = "Referenz"\nrange_m = "Abstand gemessen"',
+        ),
     ],
-    ids=["nothing", "words", "units", "drawn", "messages"],
+    ids=["nothing", "words", "units", "drawn", "messages", "no ranges", "German"],
 )
 def test_what_is_not_there_is_said_and_nothing_is_made_up(tmp_path, rows, complete, asked, said):
     guess = guess_map(write(tmp_path / "t.csv", rows))

@@ -51,6 +51,12 @@ def test_python_knows_it_by_suffix_and_by_name(source, tmp_path):
     np.testing.assert_allclose(load(tmp_path / "a.uwb").exchanges.range_m, 4.690357, rtol=1e-6)
 
 
+def test_the_longest_ending_decides(tmp_path):
+    (tmp_path / "my.blanks.csv").write_text("1 2 0 5 1005 3000\n")
+    with registered(suffixes=(".blanks.csv",)):
+        assert import_recording(tmp_path / "my.blanks.csv", tmp_path / "a.uwb") == 1
+
+
 def test_without_a_map_there_is_no_option_for_one(tmp_path):
     with registered(name="plain", map_help=None):
         assert "--map" not in succeed("uwblink", "import", "plain", "--help").stdout

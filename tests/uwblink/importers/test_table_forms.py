@@ -249,6 +249,21 @@ def test_ranges_without_stamps_with_total_powers_and_places(tmp_path, unit, scal
     assert ((bodies == "tag8").sum(), (bodies == "tag7").sum()) == (1, 30)
 
 
+@pytest.mark.parametrize(("column", "other"), [("range_m", "true distances"), ("gt_range_m", "ranges")])
+def test_the_column_in_another_unit_is_named_with_its_line_of_the_map(tmp_path, column, other):
+    rows = [{"from_id": 7, "to_id": 8, "range_m": 2.3 + 0.1 * k, "gt_range_m": 2 + 0.1 * k} for k in range(30)]
+    scaled = [row | {column: row[column] / 0.3048} for row in rows]
+    with pytest.raises(ImportTableError, match=f"in ft according to the {other}.* write units.{column} = 'ft'"):
+        read_rows(tmp_path, scaled)
+    found = read_rows(tmp_path, scaled, f"[units]\n{column} = 'ft'\n").exchanges
+    np.testing.assert_allclose(found.range_m - found.truth_m, 0.3, atol=1e-6)
+
+
+def test_a_table_without_stamps_lacks_ranges(tmp_path):
+    with pytest.raises(ImportTableError, match="column 'range_m' is missing; there are from_id, to_id, length"):
+        read_rows(tmp_path, [{"from_id": 7, "to_id": 8, "length": 2.3}] * 30)
+
+
 def as_messages(rows, third="target"):
     found = []
     for k, row in enumerate(rows):
