@@ -87,8 +87,7 @@ def test_help_fits_80_columns_loses_no_word_and_has_examples_that_parse(words, c
     ],
 )
 def test_old_names_are_answered_with_the_new_ones(words, new, tmp_path):
-    told = processes.refuse(*words.split(), "-o", tmp_path / "x.uwb")
-    assert told.startswith(f"error: {new}")
+    assert processes.refuse(*words.split(), "-o", tmp_path / "x.uwb").startswith(f"error: {new}")
     assert not list(tmp_path.iterdir())
 
 

@@ -83,5 +83,4 @@ def test_compare_optimum_and_predict_know_it_without_being_told(row, tmp_path, m
 
 def test_schema_and_summary_know_it(row):
     assert row.name in json.loads(command("uwbsim", "schema"))["$defs"]["Ranging"]["properties"]["protocol"]["enum"]
-    said = command("uwbsim", "validate", SCENARIO, "--set", f"ranging.protocol={row.name}")
-    assert row.title in said
+    assert row.title in command("uwbsim", "validate", SCENARIO, "--set", f"ranging.protocol={row.name}")

@@ -83,8 +83,7 @@ def test_intervals_of_delays_and_places_hold_in_the_stated_frame():
         a, b = world.places[k][:2, :2]
         x = (b - a) / np.linalg.norm(b - a)
         truth = (world.places[k][:, :2] - a) @ np.array([x, [-x[1], x[0]]]).T
-        beside = next(v for v in truth[2:, 1] if abs(v) > 0.2 * np.abs(truth[2:, 1]).max())
-        truth[:, 1] *= np.sign(beside)
+        truth[:, 1] *= np.sign(next(v for v in truth[2:, 1] if abs(v) > 0.2 * np.abs(truth[2:, 1]).max()))
         for n, board in enumerate(one.boards[2:], start=2):
             away = np.array(board.position_m[:2]) - truth[n]
             cov = board.covariance_m2[:2, :2] + 1e-12 * np.eye(2)
@@ -390,8 +389,7 @@ def test_the_command_takes_a_recording_an_arrangement_and_writes_what_others_rea
     assert [row["position_m"] for row in rows] == [one["position_m"] for one in told["arrangements"][1]["boards"]]
     assert rows[0]["position_m"] == [0.0, 0.0, 0.0]
     std = np.sqrt([row["covariance_m2"][0] for row in rows])
-    assert std[0] == 0
-    assert std[1:] == pytest.approx([std[1]] * 3, rel=0.8)
+    assert (std[0], std[1:]) == (0, pytest.approx([std[1]] * 3, rel=0.8))
     assert sorted(load_places(anchors)[1]) == [1, 2, 3, 4]
     # A corrected recording comes of it as of any other calibration.
     assert calib.apply(recording[0], known, tmp_path / "corrected.uwb").count == 600
