@@ -34,7 +34,7 @@ def test_the_examples_run(name, monkeypatch):
 
 
 def test_what_is_handed_out_prints_on_a_screen():
-    flight = calib.sample_flight()
+    flight = calib.sample_flight(300)
     known = calib.fit(flight).calibration
     ranges = calib.load_ranges(flight)
     columns = known.correct(ranges.raw_m, ranges.fpp1_dbm, ranges.fpp2_dbm, ranges.initiator, ranges.target)

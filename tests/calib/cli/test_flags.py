@@ -196,8 +196,7 @@ def test_one_pair_is_evaluated_without_a_number_between_pairs(folder):
 
 @pytest.fixture
 def stopped_flight(tmp_path):
-    some = calib.sample_flight()
-    Contents(exchanges=some.exchanges, poses=some.poses, tags=some.tags).save(tmp_path / "flight.uwb")
+    calib.sample_flight().save(tmp_path / "flight.uwb")
     return tmp_path / "flight.uwb"
 
 

@@ -36,8 +36,7 @@ def fitted(recipe, seed, **settings):
 
 
 def written(path, recipe, seed, number=0):
-    found, _ = flown(recipe, seed, number)
-    uwblink.Contents(exchanges=found.exchanges, poses=found.poses, tags=found.tags, meta=found.meta).save(path)
+    flown(recipe, seed, number)[0].save(path)
     return path
 
 

@@ -440,7 +440,8 @@ def test_a_flight_without_motion_capture_tells_what_it_rests_on(known):
     assert list(grades(blind).values()) == ["doubt"]
 
 
-def test_reports_of_a_survey_and_of_its_evaluation_say_what_it_rests_on(surveyed, tmp_path):
+def test_reports_of_a_survey_and_of_its_evaluation_say_what_it_rests_on(surveyed, tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "drawn", pages.outline)  # as above
     page = tmp_path / "page.html"
     write_survey_report(page, surveyed.calibration)
     text = page.read_text(encoding="utf-8")
