@@ -45,7 +45,7 @@ def scores(result, planted):
 
 def test_without_noise_delays_and_places_are_exact():
     """And delays count by the weights of either end: 0.7 of the lower tag's, 0.3 of the other one's."""
-    world = standing_boards(1, places=FOUR, pair_error_m=0.0, noise_m=0.0)
+    world = standing_boards(1, places=FOUR[:4], pair_error_m=0.0, noise_m=0.0)
     r, delay = world.ranges, np.array([0.0, *world.delays_ns.values()])
     low, high, count = np.minimum(r.initiator, r.target), np.maximum(r.initiator, r.target), np.ones(len(r))
     raw = r.raw_m - SPEED_OF_LIGHT * 0.2e-9 * (delay[low] - delay[high])
@@ -75,7 +75,7 @@ def test_planted_delays_lie_within_their_intervals(shape, boards, count):
 
 
 def test_intervals_of_delays_and_places_hold_in_the_stated_frame():
-    world = standing_boards(40, "plane", boards=5, arrangements=6)
+    world = standing_boards(40, "plane", boards=5, arrangements=5)
     result = calib.survey(world.ranges, known="plane")
     assert_sound(world, result)
     inside = []
@@ -88,7 +88,7 @@ def test_intervals_of_delays_and_places_hold_in_the_stated_frame():
             away = np.array(board.position_m[:2]) - truth[n]
             cov = board.covariance_m2[:2, :2] + 1e-12 * np.eye(2)
             inside.append(float(away @ np.linalg.solve(cov, away)) < 5.99)
-    assert np.mean(inside) > 0.8  # of 18, those of one arrangement dependent
+    assert np.mean(inside) > 0.8  # of 15, those of one arrangement dependent
 
 
 def test_three_boards_in_a_row_give_the_delay_of_the_middle_one_alone_until_distances_are_taped():
