@@ -195,9 +195,9 @@ def test_numbers_that_are_none_do_not_come_in_with_a_miluv_calibration(tmp_path,
         read_miluv(tmp_path / "m.json")
 
 
-@pytest.mark.parametrize("form", ["miluv", "ros-yaml", "c-header"])
-def test_a_form_with_one_curve_does_not_take_groups(form):
+def test_a_form_with_one_curve_does_not_take_groups():
     grouped = calib.fit(ranges(2000), groups={"a": (1, 2), "b": (3, 7)}).calibration
-    with pytest.raises(calib.BadInputError, match="export it as json"):
-        calib.export(grouped, form)
+    for form in ("miluv", "ros-yaml", "c-header"):
+        with pytest.raises(calib.BadInputError, match="export it as json"):
+            calib.export(grouped, form)
     assert calib.Calibration.from_json(calib.export(grouped, "json")) == grouped

@@ -356,31 +356,26 @@ def test_fits_of_the_same_tags_are_the_same_nineteen_times_in_twenty():
     assert 0.55 < np.std([d / one.std_ns[t] for one in found for t, d in one.difference_ns.items()]) < 1.3
 
 
-def test_a_delay_that_moved_is_seen():
-    a = calib.fit(ranges(6000)).calibration
-    found = calib.compare(a, replace(a, delays_ns=a.delays_ns | {3: a.delays_ns[3] + 0.2}))
+def test_a_delay_that_moved_is_seen(fitted):
+    found = calib.compare(fitted, replace(fitted, delays_ns=fitted.delays_ns | {3: fitted.delays_ns[3] + 0.2}))
     assert not found.same
     assert max(found.difference_ns, key=lambda t: abs(found.difference_ns[t])) == 3
     for part in (f"{found.difference_ns[3]:+.4f} ns", "the delays are different"):
         assert part in str(found)
 
 
-def test_a_shift_of_delays_against_the_curve_is_no_difference():
-    a = calib.fit(ranges(6000)).calibration
-    shift_m = 0.05
-    shift_ns = shift_m / SPEED_OF_LIGHT * 1e9
-    curve = replace(a.bias_curve, coefficients=tuple(c + shift_m for c in a.bias_curve.coefficients))
-    other = replace(a, delays_ns={t: d + shift_ns for t, d in a.delays_ns.items()}, bias_curve=curve)
-    found = calib.compare(a, other)
+def test_a_shift_of_delays_against_the_curve_is_no_difference(fitted):
+    moved_ns = {tag: delay + 0.05 / SPEED_OF_LIGHT * 1e9 for tag, delay in fitted.delays_ns.items()}
+    curve = replace(fitted.bias_curve, coefficients=tuple(c + 0.05 for c in fitted.bias_curve.coefficients))
+    found = calib.compare(fitted, replace(fitted, delays_ns=moved_ns, bias_curve=curve))
     assert found.same
     assert [found.offset_m, found.curve_rms_m] == pytest.approx([0, 0], abs=1e-9)
     assert np.abs(list(found.difference_ns.values())).max() < 1e-9
 
 
-def test_nothing_in_common_cannot_be_compared():
-    a = calib.fit(ranges(2000)).calibration
+def test_nothing_in_common_cannot_be_compared(fitted):
     with pytest.raises(calib.UnanswerableError, match="0 tags have determined delays in both"):
-        calib.compare(a, replace(a, delays_ns={99: 0.0}))
+        calib.compare(fitted, replace(fitted, delays_ns={99: 0.0}))
 
 
 def test_of_pairs_that_are_not_determined_the_others_are_corrected_and_they_are_named(tmp_path):

@@ -75,9 +75,13 @@ def test_the_planted_calibration_is_found_beside():
     assert found.correction_rms_m < 0.005
 
 
-def test_an_evaluation_prints_on_a_screen():
+@pytest.fixture(scope="module")
+def found():
     r = ranges(2000)
-    found = evaluate(r, calib.fit(r).calibration)
+    return evaluate(r, calib.fit(r).calibration)
+
+
+def test_an_evaluation_prints_on_a_screen(found):
     lines = repr(found).splitlines()
     assert max(map(len, lines[1:])) <= 80, "a terminal has room for every figure"
     cells, full = lines[-1].split(), found.overall.full
@@ -87,9 +91,7 @@ def test_an_evaluation_prints_on_a_screen():
     assert (page.count("<tr>"), page.count("data:image/png")) == (3 + 6, 1)
 
 
-def test_a_figure_has_the_errors_of_each_pair_and_of_many_pairs_the_farthest():
-    r = ranges(2000)
-    found = evaluate(r, calib.fit(r).calibration)
+def test_a_figure_has_the_errors_of_each_pair_and_of_many_pairs_the_farthest(found):
     axes = errors_by_pair(7.0, found).axes[0]
     assert [text.get_text() for text in axes.get_xticklabels()] == list(found.pairs)
     for (line, _, (bars,)), stage in zip(axes.containers, ("raw", "full"), strict=True):
