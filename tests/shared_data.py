@@ -2,6 +2,8 @@
 
 import os
 import tarfile
+from csv import DictReader
+from io import TextIOWrapper
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,13 @@ def shared(name):
     if not path.exists():
         pytest.skip(f"{name} is not in the data folder beside this checkout (or set UWBCAL_DATA)")
     return path
+
+
+def rows_of(name, ending):
+    """Return the rows, by their headers, of all tables of an archive whose names end so."""
+    with tarfile.open(shared(name)) as archive:
+        files = [archive.extractfile(one) for one in archive.getnames() if one.endswith(ending)]
+        return [row for file in files if file for row in DictReader(TextIOWrapper(file))]
 
 
 def miluv(folder):

@@ -354,12 +354,8 @@ def nothing(*names):
     return {name: np.full(COUNT, np.nan) for name in names}
 
 
-def late_poses():
-    poses = calib.sample_flight(COUNT).poses
-    return replace(poses, time_ns=poses.time_ns + 100_000_000_000)
-
-
-SAMPLE = calib.sample_flight(COUNT).exchanges
+SAMPLE, POSES = calib.sample_flight(COUNT).exchanges, calib.sample_flight(COUNT).poses
+LATE = replace(POSES, time_ns=POSES.time_ns + 100_000_000_000)
 FIT = "calib fit {here}/bad.uwb -o c.json"
 
 
@@ -369,8 +365,10 @@ FIT = "calib fit {here}/bad.uwb -o c.json"
         (nothing("fpp1_dbm", "fpp2_dbm"), FIT, ["bad.uwb", "no power"]),
         ({"fpp1_dbm": np.zeros(COUNT), "fpp2_dbm": np.full(COUNT, 3.0)}, FIT, ["bad.uwb", "no power", "+3 dBm"]),
         ({"rx2": SAMPLE.rx2 + 2**30 & 2**32 - 1}, FIT, ["bad.uwb", "none of its", "no range within 10 km"]),
-        ({"poses": late_poses()}, FIT, ["poses cover 0.0 to 11.0 s", "exchanges -99.0 to -90.0 s", "--offset"]),
-        ({"poses": late_poses()[:0]}, FIT, ["bad.uwb", "no true distance"]),
+        ({"poses": LATE}, FIT, ["poses cover 0.0 to 11.0 s", "exchanges -99.0 to -90.0 s", "--offset"]),
+        ({"poses": POSES[:0]}, FIT, ["bad.uwb", "no true distance"]),
+        ({"poses": replace(POSES, position_m=POSES.position_m * 1000)}, FIT, ["bad.uwb", "millimetres"]),
+        ({"fpp1_dbm": -SAMPLE.fpp1_dbm, "fpp2_dbm": -SAMPLE.fpp2_dbm}, FIT, ["bad.uwb", "dBm"]),
         # Two pairs do not determine three delays.
         ({"tags": []}, "uwbsim twin {here}/bad.uwb -c {c_json} -o t.toml", ["tag 1, 2, 3", "uwblink poses --tags"]),
         (
@@ -391,8 +389,7 @@ def test_what_a_recording_cannot_answer_is_status_1(seeds, tmp_path, change, lin
 
 
 def test_poses_of_a_part_of_the_flight_are_enough_for_a_warning(tmp_path):
-    poses = calib.sample_flight(COUNT).poses
-    cut = changed(tmp_path / "cut.uwb", poses=poses[poses.time_ns < 64 * 10**8])
+    cut = changed(tmp_path / "cut.uwb", poses=POSES[POSES.time_ns < 64 * 10**8])
     done = succeed("calib", "fit", cut, "-o", tmp_path / "c.json")
     assert "40 % of the exchanges were left out: no true distance" in done.stderr
 

@@ -111,8 +111,7 @@ def test_a_group_alone_prints_its_help(words):
     ],
 )
 def test_old_names_are_answered_with_the_new_ones(words, new, tmp_path):
-    told = processes.refuse(*words.split(), "-o", tmp_path / "x.uwb")
-    assert told.startswith(f"error: {new}")
+    assert processes.refuse(*words.split(), "-o", tmp_path / "x.uwb").startswith(f"error: {new}")
     assert not list(tmp_path.iterdir())
 
 

@@ -236,7 +236,7 @@ PRINTING = (
     "calib doctor hostile.uwb",
     "calib fit hostile.uwb -o out.json",
     "calib evaluate hostile.uwb -c c.json",
-    "calib localize hostile.uwb -c c.json --tum out",
+    "calib localize hostile.uwb -c c.json --seeds 1 --tum out",
     pytest.param("calib report hostile.uwb -o out.html", marks=pytest.mark.slow),  # pages: tests/calib/report
 )
 

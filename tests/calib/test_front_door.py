@@ -34,7 +34,7 @@ def test_the_examples_run(name, monkeypatch):
 
 
 def test_what_is_handed_out_prints_on_a_screen():
-    flight = calib.sample_flight()
+    flight = calib.sample_flight(300)
     known = calib.fit(flight).calibration
     ranges = calib.load_ranges(flight)
     columns = known.correct(ranges.raw_m, ranges.fpp1_dbm, ranges.fpp2_dbm, ranges.initiator, ranges.target)
@@ -94,6 +94,12 @@ def labelled(axes, text):
     return next(line for line in axes.lines if line.get_label() == text)
 
 
+def points_and_curve(axes):
+    """Return the drawn points, and the drawn curve at their powers."""
+    points, curve = labelled(axes, "core of all pairs"), labelled(axes, "fitted")
+    return points, np.interp(points.get_xdata(), curve.get_xdata(), curve.get_ydata())
+
+
 def test_points_are_the_core_that_the_curve_follows_and_medians_lie_above():
     # Planted: a core of 5 cm about nothing, a fifth of it lengthened by 40 cm in the mean.
     rng = np.random.default_rng(5)
@@ -111,8 +117,7 @@ def test_points_are_the_core_that_the_curve_follows_and_medians_lie_above():
 
 def test_the_drawn_curve_goes_through_the_drawn_points(fitted):
     axes = axes_of(fitted.plot_bias)
-    points, curve = labelled(axes, "core of all pairs"), labelled(axes, "fitted")
-    at = np.interp(points.get_xdata(), curve.get_xdata(), curve.get_ydata())
+    points, at = points_and_curve(axes)
     # 600 a bin: the centre of a core of 5 cm beside a fifth of reflections is known to 3 mm; medians lie 1.5 cm above.
     assert np.abs(points.get_ydata() - at).max() < 1.2
     assert np.sqrt(np.mean((points.get_ydata() - at) ** 2)) < 0.5
@@ -133,9 +138,7 @@ def test_the_curve_is_drawn_whole_where_its_points_are_few(fitted):
 
 
 def test_the_sigma_curve_goes_through_its_points(fitted):
-    axes = axes_of(fitted.plot_sigma)
-    points, curve = labelled(axes, "core of all pairs"), labelled(axes, "fitted")
-    at = np.interp(points.get_xdata(), curve.get_xdata(), curve.get_ydata())
+    points, at = points_and_curve(axes_of(fitted.plot_sigma))
     assert np.mean(points.get_ydata() / at) == pytest.approx(1, abs=0.06)
 
 

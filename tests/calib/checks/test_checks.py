@@ -1,11 +1,9 @@
 """The table of checks and its one budget of false alarms, real recordings, and the command."""
 
+import csv
 import json
 import re
-import tarfile
 from collections import Counter
-from csv import DictReader, DictWriter
-from io import TextIOWrapper
 
 import numpy as np
 import pytest
@@ -19,7 +17,7 @@ from calib.checks.examine import CHECKS, FINDING_LEVEL, IMPLIED
 from calib.findings import BUDGET, OF_A_FIT, exceeds
 from docs.site import checks
 from tests import processes
-from tests.shared_data import ROOT, shared
+from tests.shared_data import ROOT, rows_of, shared
 
 RNG = np.random.default_rng
 
@@ -29,11 +27,13 @@ def save(flight, path):
     return path
 
 
-def rows_of(tar, name):
-    """The rows of a table in an archive, by its headers."""
-    file = tar.extractfile(name)
-    assert file is not None
-    return list(DictReader(TextIOWrapper(file)))
+def imported(folder, names, rows, settings):
+    """Write and import a table of stamps in nanoseconds; returns the recording."""
+    with (folder / "t.csv").open("w", newline="") as out:
+        csv.writer(out).writerows([names, *rows])
+    (folder / "m.toml").write_text(f'{settings}\n[units]\nstamps = "ns"\n')
+    uwblink.import_recording(folder / "t.csv", folder / "t.uwb", map_file=folder / "m.toml")
+    return folder / "t.uwb"
 
 
 def test_checks_that_involve_chance_share_one_budget_and_the_page_shows_them_all():
@@ -53,7 +53,7 @@ def test_the_worst_of_many_is_no_surer_than_one_of_one():
 
 
 def test_the_command_prints_findings_clocks_and_p_values(tmp_path):
-    plan = Plan(seconds=30, per_second=80)
+    plan = Plan(seconds=20, per_second=60)
     sound, wrong = fly(plan, 91, 5), planted.doubled(planted.stepped(fly(plan, 92, 5), RNG(1)), RNG(2))
     paths = [save(sound, tmp_path / "sound.uwb"), save(wrong, tmp_path / "wrong.uwb")]
     shown = processes.run("calib", "doctor", paths[0]).stdout
@@ -74,20 +74,15 @@ def test_the_command_prints_findings_clocks_and_p_values(tmp_path):
 
 STAMPS = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
 STARLOC = ["time_s", "from_id", "to_id", *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "range"]
+STARLOC_DATA = "starloc_loop-2d-fast.tar.xz"
 RADIOS = {11: 10, 7: 11, 4: 12, 10: 13, 5: 15, 6: 16, 12: 6, 9: 9}
 """The marker of each radio, as the data's page says."""
 
 
 @pytest.fixture(scope="module")
 def starloc():
-    with tarfile.open(shared("starloc_loop-2d-fast.tar.xz")) as tar:
-
-        def table(name):
-            (path,) = [one for one in tar.getnames() if one.endswith(name)]
-            return rows_of(tar, path)
-
-        markers = {int(row[""]): [row[k] for k in "xyz"] for row in table("uwb_markers_v1.csv")}
-        return table("loop-2d-fast_s1/uwb.csv"), markers
+    markers = {int(row[""]): [row[k] for k in "xyz"] for row in rows_of(STARLOC_DATA, "uwb_markers_v1.csv")}
+    return rows_of(STARLOC_DATA, "loop-2d-fast_s1/uwb.csv"), markers
 
 
 @pytest.mark.parametrize(
@@ -108,17 +103,13 @@ def starloc():
 )
 def test_markers_that_are_other_radios_are_seen(starloc, tmp_path, marker_of, wrong, exchanged):
     ranges, markers = starloc
-    names = [*STARLOC, *(f"{end}_{k}_m" for end in ("from", "to") for k in "xyz")]
-    with (tmp_path / "t.csv").open("w") as out:
-        table = DictWriter(out, ["range_m" if name == "range" else name for name in names])
-        table.writeheader()
-        for row in ranges:
-            there = markers.get(marker_of[int(float(row["to_id"]))], ["", "", ""])
-            cells = [*(row[name] for name in STARLOC), *[row[f"tag_pos_{k}"] for k in "xyz"], *there]
-            table.writerow(dict(zip(table.fieldnames, cells, strict=True)))
-    (tmp_path / "m.toml").write_text('bits = 32\n[units]\nstamps = "ns"\n')
-    uwblink.import_recording(tmp_path / "t.csv", tmp_path / "t.uwb", map_file=tmp_path / "m.toml")
-    found = calib.examine(tmp_path / "t.uwb")
+    names = [*STARLOC[:-1], "range_m", *(f"{end}_{k}_m" for end in ("from", "to") for k in "xyz")]
+    rows = [
+        [row[name] for name in (*STARLOC, *(f"tag_pos_{k}" for k in "xyz"))]
+        + markers.get(marker_of[int(float(row["to_id"]))], ["", "", ""])
+        for row in ranges
+    ]
+    found = calib.examine(imported(tmp_path, names, rows, "bits = 32"))
     assert {one.evidence.split()[2] for one in found if one.fault == "anchor stands elsewhere"} == wrong
     assert {"and z from delays" in one.evidence for one in found if " tag12 " in one.evidence} <= {True}
     named = [
@@ -143,23 +134,17 @@ def test_coarse_ranges_that_follow_fast_are_not_doubled_exchanges(tmp_path):
 
 @pytest.mark.slow
 def test_logs_of_both_robots_are_doubled_exchanges(tmp_path):
-    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as tar:
-        logs = [one for one in tar.getnames() if one.endswith("uwb_range.csv")]
-        logged = [row for one in logs for row in rows_of(tar, one)]
+    logged = rows_of("miluv_cirObstacles_3_random_0.tar.xz", "uwb_range.csv")
     names = {"time_s": "timestamp", **{name: f"{name}_raw" for name in STAMPS}, "range_m": "range_raw"}
-    names |= {name: name for name in ("from_id", "to_id", "fpp1", "fpp2", "skew1", "skew2", "gt_range")}
-    with (tmp_path / "t.csv").open("w") as out:
-        table = DictWriter(out, [{"gt_range": "gt_range_m"}.get(name, name) for name in names])
-        table.writeheader()
-        for row in sorted(logged, key=lambda row: float(row["timestamp"])):
-            table.writerow(dict(zip(table.fieldnames, (row[theirs] for theirs in names.values()), strict=True)))
-    (tmp_path / "m.toml").write_text('bits = 40\n[units]\nstamps = "ns"\n')
-    uwblink.import_recording(tmp_path / "t.csv", tmp_path / "t.uwb", map_file=tmp_path / "m.toml")
+    names |= {name: name for name in ("from_id", "to_id", "fpp1", "fpp2", "skew1", "skew2")} | {
+        "gt_range_m": "gt_range"
+    }
+    in_time = sorted(logged, key=lambda row: float(row["timestamp"]))
+    path = imported(tmp_path, names, [[row[theirs] for theirs in names.values()] for row in in_time], "bits = 40")
     # The import takes each exchange once; what is made without it is not so careful.
-    with uwblink.Recording.open(tmp_path / "t.uwb") as recording:
+    with uwblink.Recording.open(path) as recording:
         once = recording.exchanges()
-    assert len(once) == len(logged) - 123
-    assert calib.examine(tmp_path / "t.uwb") == []
+    assert (len(once), calib.examine(path)) == (len(logged) - 123, [])
     twice = once[np.sort(np.concatenate([np.arange(len(once)), np.arange(123)]))]
     (found,) = calib.examine(Flight(twice, fly(Plan(seconds=1), 1).poses[:0], []))
     assert found.evidence.startswith("123 of 440 rows")

@@ -154,7 +154,9 @@ def test_import_curve_localization(folder, fitted):
         assert written["delays_ns"][str(tag)] - middle == pytest.approx(delay, abs=0.05)
     assert any("ranges without stamps" in warning for warning in written["provenance"]["warnings"])
     assert "ranges without stamps" in run("calib", "show", folder / "c.json").stdout
-    words = ("calib", "localize", folder / "ranges.uwb", "-c", folder / "c.json", "--seeds", 1, "--json")
+    (folder / "part.csv").write_text("\n".join((folder / "ranges.csv").read_text().splitlines()[:2000]) + "\n")
+    run("uwblink", "import", "csv", folder / "part.csv", "-o", folder / "part.uwb")
+    words = ("calib", "localize", folder / "part.uwb", "-c", folder / "c.json", "--seeds", 1, "--json")
     located = json.loads(run(*words).stdout)
     assert located["summary"]["rmse_m"]["calibrated"] < 0.7 * located["summary"]["rmse_m"]["raw"]
     run("calib", "apply", folder / "ranges.uwb", "-c", folder / "c.json", "--to", "csv", "-o", folder / "out")
@@ -194,8 +196,7 @@ def test_one_pair_is_evaluated_without_a_number_between_pairs(folder):
 
 @pytest.fixture
 def stopped_flight(tmp_path):
-    some = calib.sample_flight()
-    Contents(exchanges=some.exchanges, poses=some.poses, tags=some.tags).save(tmp_path / "flight.uwb")
+    calib.sample_flight().save(tmp_path / "flight.uwb")
     return tmp_path / "flight.uwb"
 
 
@@ -231,4 +232,4 @@ def test_commands_that_use_it_warn(stopped, stopped_flight, tmp_path):
 def test_a_fit_that_settled_is_quiet(stopped_flight, tmp_path):
     fitted = run("calib", "fit", stopped_flight, "-o", tmp_path / "c.json")
     applied = run("calib", "apply", stopped_flight, "-c", tmp_path / "c.json", "-o", tmp_path / "d.uwb")
-    assert "settled" not in fitted.stderr + applied.stderr
+    assert "before it converged" not in fitted.stderr + applied.stderr

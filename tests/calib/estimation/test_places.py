@@ -12,8 +12,6 @@ from calib.data.ranges import concatenate
 from tests.calib import synthetic
 from tests.calib.estimation.fields import ranges_with_field
 from tests.calib.synthetic import DELAYS_NS, about_their_mean, bias_m, ranges
-from tests.processes import refuse
-from uwblink import Contents
 
 
 def apart(result, planted):
@@ -159,17 +157,3 @@ def test_boards_that_were_programmed_with_no_delay_are_fitted():
     found = calib.fit(replace(some, raw_m=some.raw_m + 514e-9 * 299_702_547.0))
     assert all(-516 < delay < -512 for delay in found.calibration.delays_ns.values())
     assert [said for said in found.warnings if "antenna delays" in said]
-
-
-@pytest.mark.parametrize("change", ["poses", "powers"])
-def test_the_command_writes_nothing_and_ends_with_1(tmp_path, change):
-    flight = calib.sample_flight(300)
-    poses, exchanges = flight.poses, flight.exchanges
-    if change == "poses":
-        poses = replace(poses, position_m=poses.position_m * 1000)
-    else:
-        exchanges = replace(exchanges, fpp1_dbm=-exchanges.fpp1_dbm, fpp2_dbm=-exchanges.fpp2_dbm)
-    Contents(exchanges=exchanges, poses=poses, tags=flight.tags).save(tmp_path / "flight.uwb")
-    named = "millimetres" if change == "poses" else "dBm"
-    refuse("calib", "fit", tmp_path / "flight.uwb", "-o", tmp_path / "c.json", status=1, naming=[named])
-    assert [path.name for path in tmp_path.iterdir()] == ["flight.uwb"]

@@ -100,8 +100,7 @@ def test_beyond_the_fitted_values_odds_stay_constant():
 
 def test_filters_are_given_the_probability_of_each_range():
     ranges, share, _ = world(74)
-    given = range_errors(fitted(71), ranges)[1].share
-    assert np.corrcoef(given, share)[0, 1] > 0.98
+    assert np.corrcoef(range_errors(fitted(71), ranges)[1].share, share)[0, 1] > 0.98
 
 
 def test_files_keep_the_slopes_and_refuse_others(tmp_path):

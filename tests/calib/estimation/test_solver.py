@@ -43,8 +43,7 @@ def test_groups_of_tags_get_their_own_curves():
     for name, sign in (("first", 1), ("second", -1)):
         assert np.std(c.groups[name].bias_curve(grid) - (sign * bias_m(grid))) < 0.006, name
         assert c.groups[name].bias_curve(np.array([1.0]))[0] == pytest.approx(0, abs=1e-9)
-    assert Calibration.from_json(c.to_json()) == c
-    assert json.loads(c.to_json())["schema_version"] == 2
+    assert (Calibration.from_json(c.to_json()), json.loads(c.to_json())["schema_version"]) == (c, 2)
     # A range between the groups has the mean of both curves, which is none at all here.
     r = grouped(ranges(3000, seed=8), groups)
     applied = c.apply(r)
@@ -81,12 +80,12 @@ def test_a_reference_power_moves_a_constant_and_corrects_ranges_alike(settings):
 
 def test_the_band_holds_the_curve():
     inside = []
-    for seed in range(6):
+    for seed in range(3):
         c = fit(ranges(4000, seed=seed)).calibration
         grid = np.linspace(*c.bias_curve.range, 50)
         wrong = c.bias_curve(grid) - bias_m(grid)
         inside.append(np.abs(wrong - wrong.mean()) < 1.96 * np.asarray(c.band(grid, "bias"), dtype=float))
-    # 300 points, of which some eight a curve are independent: 95 % to within 3 % either side, and the tail of
+    # 150 points, of which some eight a curve are independent: 95 % to within 5 % either side, and the tail of
     # reflections that a Cauchy loss lets through takes a little more.
     assert np.mean(inside) > 0.88
 
@@ -103,8 +102,7 @@ def test_static_spans_are_left_out():
     r = ranges(6000)
     still = r.time_ns < 10_000_000_000
     moving = without_static(replace(r, truth_m=np.where(still, 2.0, r.truth_m)))
-    assert len(moving) == np.count_nonzero(~still)
-    assert moving.excluded == {"static": np.count_nonzero(still)}
+    assert (len(moving), moving.excluded) == (np.count_nonzero(~still), {"static": np.count_nonzero(still)})
     with pytest.raises(UnanswerableError, match="nothing moves"):
         without_static(replace(r, truth_m=np.full(len(r), 2.0)))
 

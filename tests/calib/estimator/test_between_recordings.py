@@ -1,7 +1,5 @@
 """The variance of offsets that few and uncertain values show, and what it makes of ranges of other recordings."""
 
-import csv
-import tarfile
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +8,7 @@ import pytest
 import calib
 from benchmarks.worlds import CLEAN, make
 from calib.estimator.to_calibration import mean_variance
-from tests.shared_data import shared
+from tests.shared_data import rows_of
 
 BOUNDS = (1e-4, 1.0)
 
@@ -67,15 +65,12 @@ def test_quiet_and_noisy_pairs_differ_between_recordings_by_as_much():
 
 
 @pytest.fixture(scope="module")
-def starloc(tmp_path_factory):
+def starloc():
     """Ranges of two flights of STAR-loc: two tags on a rig, eight anchors."""
-    folder = tmp_path_factory.mktemp("starloc")
-    with tarfile.open(shared("starloc_loop-2d-fast.tar.xz")) as archive:
-        archive.extractall(folder, filter="data")
     flights = []
     for name in ("loop-2d-fast_s1", "loop-2d-fast_s2"):
-        with open(folder / "data" / name / "uwb.csv", newline="") as file:
-            rows = [row for row in csv.DictReader(file) if row["range"] and row["gt_range"]]
+        every = rows_of("starloc_loop-2d-fast.tar.xz", f"{name}/uwb.csv")
+        rows = [row for row in every if row["range"] and row["gt_range"]]
         column = {key: np.array([float(row[key]) for row in rows]) for key in ("range", "gt_range", "fpp1", "fpp2")}
         flights.append(
             calib.Ranges.from_arrays(

@@ -115,7 +115,7 @@ def test_a_calibration_is_worth_at_least_a_third_of_the_error(flights, fitted):
 
 def test_fixed_variances_are_those_of_the_training_flight(flights, fitted):
     """Of noise of 8 cm values of the grid near it err least."""
-    flight, exact = clean(beginning(flights["test1"], 20))
+    flight, exact = clean(beginning(flights["test1"], 8))
     found = fixed_std(exact, Settings(seeds=1), flight)
     assert found.std_m["calibrated"] in (0.07, 0.1, 0.14)
     assert "tuned on" in found.source
@@ -129,7 +129,7 @@ def test_fixed_variances_are_those_of_the_training_flight(flights, fitted):
 
 
 def test_each_body_and_flight_has_noise_of_its_own(flights):
-    flight, known = clean(beginning(flights["test1"], 6))
+    flight, known = clean(beginning(flights["test1"], 4))
     one, two = localize(flight, known, Settings(seeds=2, gate=1e9))[:2]
     errors = [t.estimate_m - t.truth_m for t in (one.tracks["raw"], one.tracks["variance"], two.tracks["raw"])]
     *first, second = (np.diff(error[:200], axis=0) for error in errors)

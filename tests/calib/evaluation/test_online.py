@@ -39,7 +39,7 @@ def wrong_m(delays_ns, drift_m):
 def test_the_command_compares_states_with_fixed_delays_and_prints_their_end(known, tmp_path):
     known.save(tmp_path / "known.json")
     drift_m = {1: 0.06, 2: 0.06}
-    flight(7, 24.0, drift_m=drift_m)[0].save(tmp_path / "test.uwb")
+    flight(7, 24.0, rate_hz=50, drift_m=drift_m)[0].save(tmp_path / "test.uwb")
     words = ("calib", "localize", tmp_path / "test.uwb", "-c", tmp_path / "known.json", "--online")
     table = json.loads(succeed(*words, "--seeds", 1, "--json").stdout)
     rmse, (row,) = table["summary"]["rmse_m"], table["scenarios"]
@@ -103,6 +103,7 @@ def test_where_nothing_drifts_the_filter_is_as_good_as_with_fixed_delays(known):
     assert np.mean([one.tracks["online"].drifts.mean() for one in found]) < 0.3
 
 
+@pytest.mark.slow
 def test_delays_may_begin_to_drift_late(known):
     found, _ = flight(14, 60.0, rate_hz=50)
     ranges, after_s = found.exchanges, 1e-9 * (found.exchanges.time_ns - found.exchanges.time_ns[0]) - 30

@@ -64,7 +64,7 @@ def test_without_constants_the_filter_is_as_good_as_one_that_has_none(known):
 def test_the_command_says_that_pairs_differ(known, tmp_path):
     known.save(tmp_path / "known.json")
     for name, offset_m in (("same", 0.0), ("differs", OFFSET_M)):
-        flight(41, 6.0, offset_m=offset_m)[0].save(tmp_path / f"{name}.uwb")
+        flight(41, 4.0, offset_m=offset_m)[0].save(tmp_path / f"{name}.uwb")
     words = ("calib", "localize", tmp_path / "same.uwb", tmp_path / "differs.uwb", "-c", tmp_path / "known.json")
     text = succeed(*words, "--seeds", 1).stdout
     same, differs = json.loads(succeed(*words, "--seeds", 1, "--json").stdout)["scenarios"]

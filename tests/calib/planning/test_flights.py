@@ -77,8 +77,7 @@ def test_a_flight_like_it_promises_about_the_same():
 def test_what_nothing_determines_is_named_and_what_would_is_ranked():
     short: Any = {"seconds": 11.0, "rate_hz": 40.0}
     plan = calib.plan_flight(3, poses_until_s=0.0, **short)
-    assert plan.undetermined == (1, 2, 3, 4, 5, 6)
-    assert set(plan.half_ns.values()) == {math.inf}
+    assert (plan.undetermined, set(plan.half_ns.values())) == ((1, 2, 3, 4, 5, 6), {math.inf})
     told = {best.what: best.mean_ns for best in plan.next_best}
     assert next(iter(told)) == "positions known for the first 10 s"
     assert [*told.values()] == sorted(told.values())
@@ -95,8 +94,7 @@ def test_what_nothing_determines_is_named_and_what_would_is_ranked():
 def test_sought_anchors_stay_open_and_given_ones_do_not():
     seen = flight(seconds=8.0, anchors=CORNERS, rate=60)
     sought = calib.plan_flight(seen, poses_until_s=3.0, anchor_places="sought")
-    assert sought.undetermined == ANCHORS
-    assert sought.next_best[0].what == "measured positions of the anchors"
+    assert (sought.undetermined, sought.next_best[0].what) == (ANCHORS, "measured positions of the anchors")
     assert 1.96 * mean_ns(seen, poses_until_s=3.0) == pytest.approx(sought.next_best[0].mean_ns, rel=0.02)
 
 
@@ -128,8 +126,7 @@ def test_an_accelerometer_bridges_few_ranges_and_a_good_one_more():
     # A grade is the noise of a tenth of a second, and what propellers leave.
     graded = 3 * math.hypot(3e-3 / math.sqrt(0.1), 0.2)
     good, poor, none = (mean_ns(seen, poses_until_s=4.0, force=force) for force in (0.02, graded, None))
-    half_ns = np.sqrt(np.mean(np.square(list(plan.open_ns.values()))))
-    assert half_ns == pytest.approx(1.96 * poor, rel=1e-4)
+    assert np.sqrt(np.mean(np.square(list(plan.open_ns.values())))) == pytest.approx(1.96 * poor, rel=1e-4)
     assert good < 0.97 * none
     assert good < poor < 1.05 * none
 

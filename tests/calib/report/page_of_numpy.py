@@ -107,21 +107,23 @@ class Corrected:
             rows = self.pair == name
             factor = model["pairs"].get(name, {"noise": 1.0, "odds": 1.0, "detour": 1.0})
             detour = model["detour_m"] * factor["detour"]
+            first = detour / (1 - model["long_share"] + model["long_share"] * model["long_factor"])
+            kinds = (1 - model["long_share"], first), (model["long_share"], model["long_factor"] * first)
 
             def parts(lifted, factor=factor):
                 noise = np.exp(np.interp(lifted, nodes, np.log(model["noise_m"]))) * factor["noise"]
                 return noise, 1 / (1 + np.exp(-np.interp(lifted, nodes, odds)) / factor["odds"])
 
-            def below(x, lifted, detour=detour, parts=parts):
+            def below(x, lifted, kinds=kinds, parts=parts):
                 noise, share = parts(lifted)
                 x = x - model["location_m"]
-                reflected = exponnorm.cdf(x, detour / noise, loc=least, scale=noise)
+                reflected = sum(part * exponnorm.cdf(x, m / noise, loc=least, scale=noise) for part, m in kinds)
                 inside = (1 - share) * norm.cdf(x / noise) + share * reflected
                 return (1 - p_out) * inside + p_out * norm.cdf(x / model["outlier_m"])
 
             noise, share = parts(self.lifted[rows])
             mean = (1 - p_out) * share * (least + detour)
-            second = (1 - p_out) * (noise**2 + share * (detour**2 + (least + detour) ** 2))
+            second = (1 - p_out) * (noise**2 + share * sum(part * (m**2 + (least + m) ** 2) for part, m in kinds))
             second += p_out * model["outlier_m"] ** 2
             self.mean_error[rows] = mean + model["location_m"]
             total = model["scale"] * np.sqrt(second - mean**2)

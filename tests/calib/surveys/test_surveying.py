@@ -45,7 +45,7 @@ def scores(result, planted):
 
 def test_without_noise_delays_and_places_are_exact():
     """And delays count by the weights of either end: 0.7 of the lower tag's, 0.3 of the other one's."""
-    world = standing_boards(1, places=FOUR, pair_error_m=0.0, noise_m=0.0)
+    world = standing_boards(1, places=FOUR[:4], pair_error_m=0.0, noise_m=0.0)
     r, delay = world.ranges, np.array([0.0, *world.delays_ns.values()])
     low, high, count = np.minimum(r.initiator, r.target), np.maximum(r.initiator, r.target), np.ones(len(r))
     raw = r.raw_m - SPEED_OF_LIGHT * 0.2e-9 * (delay[low] - delay[high])
@@ -75,7 +75,7 @@ def test_planted_delays_lie_within_their_intervals(shape, boards, count):
 
 
 def test_intervals_of_delays_and_places_hold_in_the_stated_frame():
-    world = standing_boards(40, "plane", boards=5, arrangements=6)
+    world = standing_boards(40, "plane", boards=5, arrangements=5)
     result = calib.survey(world.ranges, known="plane")
     assert_sound(world, result)
     inside = []
@@ -83,13 +83,12 @@ def test_intervals_of_delays_and_places_hold_in_the_stated_frame():
         a, b = world.places[k][:2, :2]
         x = (b - a) / np.linalg.norm(b - a)
         truth = (world.places[k][:, :2] - a) @ np.array([x, [-x[1], x[0]]]).T
-        beside = next(v for v in truth[2:, 1] if abs(v) > 0.2 * np.abs(truth[2:, 1]).max())
-        truth[:, 1] *= np.sign(beside)
+        truth[:, 1] *= np.sign(next(v for v in truth[2:, 1] if abs(v) > 0.2 * np.abs(truth[2:, 1]).max()))
         for n, board in enumerate(one.boards[2:], start=2):
             away = np.array(board.position_m[:2]) - truth[n]
             cov = board.covariance_m2[:2, :2] + 1e-12 * np.eye(2)
             inside.append(float(away @ np.linalg.solve(cov, away)) < 5.99)
-    assert np.mean(inside) > 0.8  # of 18, those of one arrangement dependent
+    assert np.mean(inside) > 0.8  # of 15, those of one arrangement dependent
 
 
 def test_three_boards_in_a_row_give_the_delay_of_the_middle_one_alone_until_distances_are_taped():
@@ -390,8 +389,7 @@ def test_the_command_takes_a_recording_an_arrangement_and_writes_what_others_rea
     assert [row["position_m"] for row in rows] == [one["position_m"] for one in told["arrangements"][1]["boards"]]
     assert rows[0]["position_m"] == [0.0, 0.0, 0.0]
     std = np.sqrt([row["covariance_m2"][0] for row in rows])
-    assert std[0] == 0
-    assert std[1:] == pytest.approx([std[1]] * 3, rel=0.8)
+    assert (std[0], std[1:]) == (0, pytest.approx([std[1]] * 3, rel=0.8))
     assert sorted(load_places(anchors)[1]) == [1, 2, 3, 4]
     # A corrected recording comes of it as of any other calibration.
     assert calib.apply(recording[0], known, tmp_path / "corrected.uwb").count == 600
