@@ -76,8 +76,7 @@ def test_single_sided_report_has_no_third_message_and_whole_ticks(pair):
     assert (report.tx3, report.rx3) == (0, 0)
     dt41, dt32 = int(elapsed(report.rx2, report.tx1)), int(elapsed(report.tx2, report.rx1))
     assert dt32 == (1500 * 65536 + 16436) - ((report.rx1 + 1500 * 65536) % 512)
-    ticks = int((dt41 - dt32) / 2)
-    assert report.range_m == pytest.approx(ticks * 299_702_547 / (128 * 499.2e6), abs=2e-4)
+    assert report.range_m == pytest.approx(int((dt41 - dt32) / 2) * 299_702_547 / (128 * 499.2e6), abs=2e-4)
 
 
 def test_every_delay_that_the_driver_sets_is_set_at_the_target_and_works(pair):

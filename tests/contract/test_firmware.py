@@ -97,8 +97,7 @@ def test_impulse_responses_follow_reports_by_four_to_six_milliseconds():
     after = [b[0] - a[0] for a, b in zip(said(ports, 1, b"R05"), said(ports, 1, b"S10"), strict=True)]
     assert 3.8 <= min(after) < 4.3
     assert 5.5 < max(after) <= 6.0
-    lines = [data[:3] for _, data in said(ports, 2) if data[:3] in (b"S10", b"S05")]
-    assert lines == [b"S10", b"S05"] * 40
+    assert [data[:3] for _, data in said(ports, 2) if data[:3] in (b"S10", b"S05")] == [b"S10", b"S05"] * 40
 
 
 def test_passive_boards_print_zeros_for_tries_that_fail_and_others_warn():
@@ -188,8 +187,7 @@ def test_of_two_frames_at_once_the_first_is_received_where_it_is_stronger_by_the
     bench.advance(NS_PER_MS)
     for board in sorted(starts, key=lambda b: starts[b]):
         bench.advance(2 * NS_PER_MS + starts[board])
-        radio = bench.boards[board].radio
-        radio.send(board + 1, RangeCommand(board + 1), bench.air.first_stamp(board))
+        bench.boards[board].radio.send(board + 1, RangeCommand(board + 1), bench.air.first_stamp(board))
     bench.advance(3 * NS_PER_MS)
     assert next(r.frame.sender if r else None for r in came) == received
 

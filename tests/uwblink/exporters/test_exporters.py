@@ -74,8 +74,7 @@ def test_what_cannot_be_exported_leaves_nothing(whole, tmp_path):
     ):
         with pytest.raises(error, match=said):
             export_recording(path, tmp_path / out, to=to, force=force)
-    assert sorted(tmp_path.rglob("*")) == before
-    assert (tmp_path / "there" / "mine").read_text() == "mine"
+    assert (sorted(tmp_path.rglob("*")), (tmp_path / "there" / "mine").read_text()) == (before, "mine")
     (tmp_path / "there" / "mine").rename(tmp_path / "there" / "meta.csv")
     export_recording(whole, tmp_path / "there", to="csv", force=True)
     assert sorted(path.stem for path in (tmp_path / "there").iterdir()) == sorted(TABLES)
@@ -300,8 +299,7 @@ def corrected(tmp_path_factory):
 def test_corrected_ranges_leave_with_what_is_known_of_each(corrected, tmp_path, form):
     folder, exchanges, known, applied = corrected
     calib.apply(folder / "f.uwb", known, tmp_path / "out", to=form)
-    read = {"csv": pd.read_csv, "parquet": pd.read_parquet}[form]
-    frame = read(tmp_path / "out" / f"corrected.{form}")
+    frame = {"csv": pd.read_csv, "parquet": pd.read_parquet}[form](tmp_path / "out" / f"corrected.{form}")
     assert frame["time_ns"].tolist() == exchanges.time_ns.tolist()
     for name in ("raw_m", "corrected_m", "sigma_m", "sigma_total_m", "tail_share", "tail_probability", "clamped"):
         # Pandas before 3 reads floats to 3e-14; that every digit is in the file shows when it comes in again, below.

@@ -175,8 +175,7 @@ def test_halves_of_a_run_agree_within_their_intervals(recorded, run, first):
         )
         for h in (~later, later)
     ]
-    settings = calib.FitSettings(constants="pair", delays_only=True, between_m=0.0)
-    fitted = calib.fit(halves[first], settings)
+    fitted = calib.fit(halves[first], calib.FitSettings(constants="pair", delays_only=True, between_m=0.0))
     stage = calib.evaluate(halves[1 - first], fitted.calibration).to_dict()["overall"]
     assert abs(stage["full"]["median_m"]) < 0.02
     # Of 270 ranges 95 % and four standard errors, which count double, since errors last.

@@ -312,7 +312,14 @@ def test_the_page_has_a_row_a_form():
     assert [row for row in rows if row in FORMS] == list(FORMS)
 
 
-@pytest.mark.parametrize("name", FORMS)
+RARER = (
+    "wide, `Distance 1`", "wide, `r_AN0`", "DWM1001 `les`", "AT+RANGE", "AT+RANGE with ids", "Arduino prints",
+    "TREK1000", "powers named `RSSI_fp`", "65535 for no range", "ids that are words",
+)  # fmt: skip
+"""Forms of which a sibling above is read in every run: the same kind of file with one more or one other property."""
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in RARER)) for name in FORMS])
 def test_a_form_comes_in_by_its_guess(tmp_path, name):
     form = FORMS[name]
     (tmp_path / "in").mkdir()

@@ -82,8 +82,7 @@ def folder(tmp_path_factory):
     processes.succeed("uwbsim", "show", NLOS_OFFICE, "-o", folder / "scene.html")
     (folder / "out").mkdir()
     (folder / "out" / "compare.csv").write_text("old")
-    more = ["--force", "--json", "--figures", folder / "paper"]
-    done = processes.succeed("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 3000, *more)
+    done = processes.succeed("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 300, "--force", "--json")
     (folder / "told.json").write_text(done.stdout)
     return folder
 
@@ -107,13 +106,21 @@ def test_a_comparison_has_tables_and_json_and_takes_the_place_of_no_other(folder
     processes.refuse("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 10, naming=["--force"])
 
 
-def test_figures_for_a_paper_stand_in_a_folder_of_their_own(folder):
+@pytest.mark.slow
+def test_figures_for_a_paper_stand_in_a_folder_of_their_own(tmp_path):
+    words = ["uwbsim", "compare", BENCH, "-o", tmp_path / "out", "-n", 10, "--figures", tmp_path / "paper"]
+    processes.succeed(*words)
     names = ("errors", "over-relative-skew-of-the-clocks", "over-delay-of-the-scheduled-message")
     files = {f"{name}-{form}" for name in names for form in ("page.svg", "page.pdf", "column.svg", "column.pdf")}
-    assert {path.name for path in (folder / "paper").iterdir()} == files
-    more = ["-n", 10, "--figures", folder / "paper"]
-    processes.refuse("uwbsim", "compare", BENCH, "-o", folder / "new", *more, naming=["paper", "--force"])
-    assert not (folder / "new").exists()
+    assert {path.name for path in (tmp_path / "paper").iterdir()} == files
+
+
+def test_figures_for_a_paper_take_the_place_of_no_others(tmp_path):
+    (tmp_path / "paper").mkdir()
+    (tmp_path / "paper" / "errors-page.svg").touch()
+    words = ["uwbsim", "compare", BENCH, "-o", tmp_path / "new", "-n", 10, "--figures", tmp_path / "paper"]
+    processes.refuse(*words, naming=["paper", "--force"])
+    assert not (tmp_path / "new").exists()
 
 
 def test_protocols_far_apart_are_drawn_about_their_medians_and_whole_half_ticks_as_one_hill():
