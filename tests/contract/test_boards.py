@@ -275,6 +275,7 @@ def test_a_power_cycle_forgets_passive_listening_and_the_delay():
     assert (board.passive, board.delay_uus) == (False, 1500)
 
 
+@pytest.mark.slow
 def test_a_listener_that_misses_the_response_prints_26_fields_and_otherwise_nothing():
     ranging = [(10 + 60 * k, 1, b"C05|2|1|1|0\r") for k in range(240)]
     lossy = VirtualPorts(bench_scenario(), lost_share=0.3)

@@ -138,6 +138,7 @@ def test_a_listener_that_misses_the_last_frame_is_deaf_until_another_comes():
     assert [data[:3] for _, data in said(ports, 3)] == [b"R04", b"R01"], "which it does not take for a broadcast"
 
 
+@pytest.mark.slow
 def test_passive_boards_answer_late_where_frames_are_lost():
     """Asked 15 ms before the next exchange: the firmware answered 5 of 60 C01s only when that came, the others soon."""
     waits = []
@@ -197,8 +198,8 @@ def test_two_exchanges_at_once_disturb_each_other_near_by_and_not_far_away():
     for distance_m in (3.0, 900.0):
         ports = VirtualPorts(places([0.0, 2.0, distance_m, distance_m + 2.0]))
         frames = sent_frames(ports)
-        writes = [(10 + 70 * k, board, b"C05|%d|0|1|0\r" % (board + 1)) for k in range(50) for board in (1, 3)]
-        played(*writes, until_ms=10 + 70 * 50, ports=ports)
+        writes = [(10 + 70 * k, board, b"C05|%d|0|1|0\r" % (board + 1)) for k in range(20) for board in (1, 3)]
+        played(*writes, until_ms=10 + 70 * 20, ports=ports)
         good = sum(len(said(ports, board, b"R05")) for board in (1, 3))
         shares[distance_m] = good / sum(isinstance(f.payload, RangeCommand) for f in frames)
     assert shares[900.0] == 1

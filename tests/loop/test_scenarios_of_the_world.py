@@ -77,7 +77,7 @@ def test_obstacles_and_echoes_lengthen_ranges(tmp_path):
     [
         pytest.param("icra2023/test2.toml", [], marks=pytest.mark.slow),
         ("noiseless.toml", []),
-        ("anchors_and_tag/anchors_and_tag.toml", []),
+        pytest.param("anchors_and_tag/anchors_and_tag.toml", [], marks=pytest.mark.slow),
         pytest.param("day30/train.toml", ["run.duration_s=60"], marks=pytest.mark.slow),
         pytest.param("nlos_office/office.toml", [], marks=pytest.mark.slow),
         ("wrap/wrap.toml", []),

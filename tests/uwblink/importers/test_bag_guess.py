@@ -149,7 +149,11 @@ FORMS = {
 }
 
 
-@pytest.mark.parametrize("name", FORMS)
+RARER = ("Range without a tag", "numbers", "fields, and Range")
+"""Forms of which a sibling above or below is read in every run."""
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in RARER)) for name in FORMS])
 def test_ranges_of_a_bag_come_in_by_its_guess(tmp_path, name):
     write, topics, template, asked = FORMS[name]
     found = by_guess(tmp_path, write(tmp_path / ("b.bag" if write is ros1 else "b"), topics), asked)

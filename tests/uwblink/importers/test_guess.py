@@ -92,7 +92,7 @@ def test_the_public_table_of_single_sided_ranges(tmp_path):
     [
         ("event", ("tx", "rx"), "ticks"),
         ("direction", ("Sent", "Received"), "device_timestamp"),
-        ("event", ("tx", "rx"), "stamp"),
+        pytest.param("event", ("tx", "rx"), "stamp", marks=pytest.mark.slow),
     ],
 )
 def test_a_row_a_stamp(tmp_path, event, words, clock):

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import uwbsim
-from tests import processes
+from tests import pages, processes
 from tests.browser import lies_well
 from tests.shared_data import ROOT
 from uwblink import PROTOCOLS
+from uwblink.pages import figures
 from uwblink.pages.figures import picture, style
 from uwblink.ticks import METRES_PER_TICK
 from uwbsim.pages import write_sweep_page
@@ -106,20 +107,14 @@ def test_a_comparison_has_tables_and_json_and_takes_the_place_of_no_other(folder
     processes.refuse("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 10, naming=["--force"])
 
 
-@pytest.mark.slow
-def test_figures_for_a_paper_stand_in_a_folder_of_their_own(tmp_path):
-    words = ["uwbsim", "compare", BENCH, "-o", tmp_path / "out", "-n", 10, "--figures", tmp_path / "paper"]
-    processes.succeed(*words)
+def test_figures_for_a_paper_stand_in_a_folder_of_their_own_and_take_the_place_of_no_others(tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "drawn", pages.outline)
+    words = ["uwbsim", "compare", BENCH, "-n", 10, "--figures", tmp_path / "paper", "-o"]
+    processes.succeed(*words, tmp_path / "out")
     names = ("errors", "over-relative-skew-of-the-clocks", "over-delay-of-the-scheduled-message")
     files = {f"{name}-{form}" for name in names for form in ("page.svg", "page.pdf", "column.svg", "column.pdf")}
     assert {path.name for path in (tmp_path / "paper").iterdir()} == files
-
-
-def test_figures_for_a_paper_take_the_place_of_no_others(tmp_path):
-    (tmp_path / "paper").mkdir()
-    (tmp_path / "paper" / "errors-page.svg").touch()
-    words = ["uwbsim", "compare", BENCH, "-o", tmp_path / "new", "-n", 10, "--figures", tmp_path / "paper"]
-    processes.refuse(*words, naming=["paper", "--force"])
+    processes.refuse(*words, tmp_path / "new", naming=["paper", "--force"])
     assert not (tmp_path / "new").exists()
 
 
