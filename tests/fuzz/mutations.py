@@ -156,7 +156,6 @@ def _statement(db: duckdb.DuckDBPyConnection, rng: random.Random) -> tuple[str, 
 
 def _meta(db: duckdb.DuckDBPyConnection, rng: random.Random) -> tuple[str, list[Any]]:
     key, value = rng.choice(db.execute("SELECT key, value FROM meta").fetchall())
-    mutation = rng.choice(JSON)
-    changed = mutation(str(value).encode(), rng)
+    changed = rng.choice(JSON)(str(value).encode(), rng)
     text = None if changed is None or rng.random() < 0.1 else changed.decode("utf-8", "replace").replace("\x00", "")
     return "UPDATE meta SET value = ? WHERE key = ?", [text, key]

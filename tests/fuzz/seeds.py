@@ -233,8 +233,7 @@ def _write_tables(folder: Path) -> None:
         (next((folder / "tum").glob("ifo001*")), "poses.tum"),
         (folder / "exported/poses.csv", "poses.csv"),
     ):
-        first = source.read_text().splitlines(keepends=True)[:300]
-        (folder / name).write_text("".join(first))
+        (folder / name).write_text("".join(source.read_text().splitlines(keepends=True)[:300]))
 
 
 def _write_forms(folder: Path) -> None:

@@ -169,8 +169,7 @@ def test_programmed_boards_are_not_recorded_as_if_they_were_not(loop, tmp_path):
     with pytest.raises(PlanError, match=r"board 1.*16436"):
         record(world, tmp_path / "f.uwb", loop / "firmware.toml", said=False)
     assert not list(tmp_path.glob("f.uwb*"))
-    some = (loop / "firmware.toml").read_text().split("\n\n")
-    (tmp_path / "some.toml").write_text("\n".join(some[:2]))
+    (tmp_path / "some.toml").write_text("\n".join((loop / "firmware.toml").read_text().split("\n\n")[:2]))
     with pytest.raises(PlanError, match="board 3, 4"):
         record(world, tmp_path / "f.uwb", tmp_path / "some.toml")
     (tmp_path / "unclear.toml").write_text("[antenna_delays]\ntx = 16446\nrx = 16449\n")
@@ -198,8 +197,7 @@ def test_a_calibration_of_other_delays_is_told_wherever_it_is_used(loop, tmp_pat
 
 
 def test_where_nothing_says_what_was_programmed_no_register_is_guessed(tmp_path):
-    flight = calib.sample_flight()
-    known = calib.fit(replace(calib.load_ranges(flight), antenna_delays={})).calibration
+    known = calib.fit(replace(calib.load_ranges(calib.sample_flight()), antenna_delays={})).calibration
     known.save(tmp_path / "c.json")
     refuse("calib", "export", tmp_path / "c.json", "--to", "registers", naming=["--antenna-delays"])
     (tmp_path / "d.toml").write_text("[antenna_delays]\ntx = 100\nrx = 200\nreply = 300\n")
@@ -223,7 +221,6 @@ def test_a_flight_into_whose_tags_something_was_programmed_has_the_planted_delay
         flight = uwblink.load(tmp_path / f"{name}.uwb")
         planted.append(flight.meta["planted"]["delays_ns"])
         found = calib.fit(flight).calibration
-        apart = np.array([found.delays_ns[tag] - planted[-1][str(tag)] for tag in rows])
-        assert np.ptp(apart) < 0.03
+        assert np.ptp(np.array([found.delays_ns[tag] - planted[-1][str(tag)] for tag in rows])) < 0.03
     for tag, (a, b) in rows.items():
         assert planted[1][str(tag)] - planted[0][str(tag)] == pytest.approx((a + b - 2 * 16436) * TICK_S * 1e9)

@@ -62,8 +62,7 @@ def test_of_two_groups_the_sums_are_determined(tmp_path, name):
     planted = {pair: sum(r.planted["delays_ns"][str(tag)] for tag in pair) for pair in found.pair_constants}
     # The curve that was planted is not zero at the reference power, and adds a constant to all.
     away = {pair: one.offset_m + 0.5e-9 * SPEED_OF_LIGHT * planted[pair] for pair, one in found.pair_constants.items()}
-    spread = max(one.std_m for one in found.pair_constants.values())
-    assert np.ptp(list(away.values())) < 5 * spread < 0.06
+    assert np.ptp(list(away.values())) < 5 * max(one.std_m for one in found.pair_constants.values()) < 0.06
 
 
 def test_obstacles_and_echoes_lengthen_ranges(tmp_path):
@@ -78,7 +77,7 @@ def test_obstacles_and_echoes_lengthen_ranges(tmp_path):
     [
         pytest.param("icra2023/test2.toml", [], marks=pytest.mark.slow),
         ("noiseless.toml", []),
-        ("anchors_and_tag/anchors_and_tag.toml", []),
+        pytest.param("anchors_and_tag/anchors_and_tag.toml", [], marks=pytest.mark.slow),
         pytest.param("day30/train.toml", ["run.duration_s=60"], marks=pytest.mark.slow),
         pytest.param("nlos_office/office.toml", [], marks=pytest.mark.slow),
         ("wrap/wrap.toml", []),

@@ -36,7 +36,7 @@ FORMS = {
 
 @contextmanager
 def printing(text, *, asked=b"", banner=""):
-    """Serve a board that prints a text ten times a second, after it was asked for it; gives the port's name."""
+    """Serve a board that prints a text some 25 times a second, after it was asked for it; gives the port's name."""
     terminal, end = Terminal(), threading.Event()
 
     def run():
@@ -48,9 +48,9 @@ def printing(text, *, asked=b"", banner=""):
                 # In two pieces, as serial lines come.
                 data = text.encode()
                 terminal.write(data[:9])
-                time.sleep(0.03)
+                time.sleep(0.01)
                 terminal.write(data[9:])
-            time.sleep(0.1)
+            time.sleep(0.03)
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
@@ -74,7 +74,7 @@ def test_what_a_board_prints_is_recorded(tmp_path, name):
     text, devices = FORMS[name]
     start = DIALECTS[name].start
     with printing(text, asked=start, banner="\r\n DWM1001 TWR Real Time Location System\r\n\r\ndwm> \r\n") as port:
-        words = ("--dialect", name, "--ids", "40", "--duration", "1.5", "-o", "r.uwb")
+        words = ("--dialect", name, "--ids", "40", "--duration", "1.0", "-o", "r.uwb")
         assert "ranges of" in succeed("uwblink", "record", port, *words, cwd=tmp_path).stdout
     found = uwblink.load(tmp_path / "r.uwb")
     e, names = found.exchanges, {tag.tag: tag.body for tag in found.tags}
@@ -216,7 +216,7 @@ def test_the_page_shows_printed_ranges_and_their_corrections(tmp_path):
     correct = load_correction(calibrated(tmp_path, 40, 6018))
     one, other = BOTH.splitlines(keepends=True)
     with printing(one) as port, LivePage(tmp_path / "r.uwb", correct=correct) as page:
-        how: dict[str, Any] = {"ids": [40], "duration_s": 1.5, "watch": page.watch, "listeners": [page]}
+        how: dict[str, Any] = {"ids": [40], "duration_s": 1.0, "watch": page.watch, "listeners": [page]}
         done = uwblink.boards.record_printed([port], tmp_path / "r.uwb", dialect_of("arduino"), **how)
         body = page.body()
     assert f"{done.exchanges} ranges of 2 devices" in str(done)
@@ -233,7 +233,7 @@ def test_the_page_shows_printed_ranges_and_their_corrections(tmp_path):
 def test_a_stream_is_recorded_as_well_and_the_command_serves_the_page(tmp_path):
     calibrated(tmp_path, 40, 6018)
     with printing(BOTH.splitlines(keepends=True)[0]) as port:
-        words = ("--dialect", "arduino", "--ids", "40", "-c", "c.json", "--duration", "1.5", "-o")
+        words = ("--dialect", "arduino", "--ids", "40", "-c", "c.json", "--duration", "1.0", "-o")
         streamed = succeed("uwblink", "stream", port, *words, "s.uwb", cwd=tmp_path)
         recorded = succeed("uwblink", "record", port, *words, "r.uwb", "--live", cwd=tmp_path)
         for wrong, naming in (
@@ -244,8 +244,7 @@ def test_a_stream_is_recorded_as_well_and_the_command_serves_the_page(tmp_path):
         ):
             refuse("uwblink", *wrong, cwd=tmp_path, naming=naming)
     rows = [json.loads(line) for line in streamed.stdout.splitlines()]
-    found = uwblink.load(tmp_path / "s.uwb").exchanges
-    assert len(found) == len(rows) >= 5
+    assert len(uwblink.load(tmp_path / "s.uwb").exchanges) == len(rows) >= 5
     assert [row["corrected_m"] for row in rows] == pytest.approx([0.75] * len(rows))
     assert "live page: http://127.0.0.1:" in recorded.stderr
     assert set(uwblink.load(tmp_path / "r.uwb").exchanges.range_m.tolist()) == {1.0}

@@ -24,7 +24,7 @@ from uwblink.wire.messages import RangeReport
 from uwbsim.boards.virtual_board import VirtualPorts
 
 
-def recorded(path, *listeners, ports=None, seconds=4.0):
+def recorded(path, *listeners, ports=None, seconds=2.0):
     return record_bench(path, None, ports, duration_s=seconds, listeners=listeners)
 
 
@@ -33,7 +33,7 @@ def test_a_function_hears_every_message_that_the_file_gets(tmp_path):
     done = recorded(tmp_path / "f.uwb", heard.append)
     reports = [h for h in heard if isinstance(h.message, RangeReport)]
     # In virtual time at 50 Hz none is missing.
-    assert len(reports) == done.exchanges == done.tried == pytest.approx(200, abs=1)
+    assert len(reports) == done.exchanges == done.tried == pytest.approx(100, abs=1)
     e = uwblink.load(tmp_path / "f.uwb").exchanges
     told = [(h.board, h.message.tx1) for h in reports]
     assert told == list(zip(e.initiator.tolist(), e.tx1.tolist(), strict=True))

@@ -106,8 +106,7 @@ def written(tmp_path, text):
 
 def test_a_whole_plan(tmp_path):
     text = "pairs = [[1, 2], [3, 1]]\nrate_hz = 50\nprotocol = 'ss'\ntarget_reports = true\nget_cir = true\n"
-    seat = "[[tags]]\nid = 1\nbody = 'a'\nlever_arm_m = [0.1, 0, -1]\n"
-    plan = load_plan(written(tmp_path, text + seat))
+    plan = load_plan(written(tmp_path, text + "[[tags]]\nid = 1\nbody = 'a'\nlever_arm_m = [0.1, 0, -1]\n"))
     tags = (Tag(1, "a", (0.1, 0.0, -1.0)),)
     expected = RangingPlan(((1, 2), (3, 1)), rate_hz=50, protocol="ss", target_reports=True, get_cir=True, tags=tags)
     assert (plan, plan.turns([1, 2, 3])) == (expected, ((1, 2), (3, 1)))

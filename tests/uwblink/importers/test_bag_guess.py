@@ -149,11 +149,14 @@ FORMS = {
 }
 
 
-@pytest.mark.parametrize("name", FORMS)
+RARER = ("Range without a tag", "numbers", "fields, and Range")
+"""Forms of which a sibling above or below is read in every run."""
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in RARER)) for name in FORMS])
 def test_ranges_of_a_bag_come_in_by_its_guess(tmp_path, name):
     write, topics, template, asked = FORMS[name]
-    bag = write(tmp_path / ("b.bag" if write is ros1 else "b"), topics)
-    found = by_guess(tmp_path, bag, asked)
+    found = by_guess(tmp_path, write(tmp_path / ("b.bag" if write is ros1 else "b"), topics), asked)
     text = (tmp_path / "map.toml").read_text()
     assert f"[topics.{json.dumps(template)}]\n" in text
     assert "header.stamp" not in text, "the time of a message is used"
@@ -207,8 +210,7 @@ NO_TOPIC = r"no topic '/uwb/.*there are /uwb/tag7/b/range_9 \(sensor_msgs"
 
 def test_a_template_of_topics_in_a_map(tmp_path):
     """A place is within a part of a name, and a constant of a topic of its own goes before that of a template."""
-    topics = RANGES | {"/uwb/tag7/b/range_9": (RANGE, of_anchor(0, as_range))}
-    bag = ros2(tmp_path / "b", topics)
+    bag = ros2(tmp_path / "b", RANGES | {"/uwb/tag7/b/range_9": (RANGE, of_anchor(0, as_range))})
     text = '[topics."/uwb/tag{from_id}/range_{to_id}"]\nfpp2 = -80\n[topics."/uwb/tag7/range_2"]\nfpp2 = -90\n'
     e = by_map(tmp_path, bag, text + '[columns]\nrange_m = "range"\n').exchanges
     assert len(e) == len(PLANT)

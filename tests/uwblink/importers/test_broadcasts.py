@@ -1,5 +1,6 @@
 """Logs of boards that range by broadcast: made here by clocks of their own, and recorded ones."""
 
+import functools
 import json
 import shutil
 import tarfile
@@ -89,9 +90,9 @@ def test_every_reception_comes_from_the_lists_and_exchanges_from_receptions(tmp_
 
 
 def test_numbers_that_begin_anew_are_other_frames(tmp_path):
-    first, second = broadcasts(rounds=120), broadcasts(rounds=120, slot_s=0.007)
+    first, second = broadcasts(rounds=60), broadcasts(rounds=60, slot_s=0.007)
     found = imported(tmp_path, printed(first) + printed(second))
-    assert len(found.exchanges) > 6 * 2 * 110
+    assert len(found.exchanges) > 6 * 2 * 50
     assert np.abs(raw_range(found.exchanges) - distances(found)).max() < 0.01
 
 
@@ -110,17 +111,19 @@ def test_maps_that_cannot_be_are_refused_with_the_key(tmp_path, change, said):
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """The recorded logs by their first number, imported."""
+    """Imports a recorded log by its first number, once; gives the path."""
     folder = tmp_path_factory.mktemp("swarm")
     with tarfile.open(shared("swarm_broadcast_logs.tar.xz")) as archive:
         archive.extractall(folder, filter="data")
-    found = {}
-    for log in folder.rglob("*.log"):
+
+    @functools.cache
+    def of_run(run):
+        (log,) = folder.rglob(f"{run}-*.log")
         (folder / "m.toml").write_text(guess_map(log).text)
-        run = int(log.name.split("-")[0])
-        found[run] = folder / f"{run}.uwb"
-        import_file(log, found[run], importer="csv", map_file=folder / "m.toml")
-    return found
+        import_file(log, folder / f"{run}.uwb", importer="csv", map_file=folder / "m.toml")
+        return folder / f"{run}.uwb"
+
+    return of_run
 
 
 def by_pair(e):
@@ -131,7 +134,7 @@ def by_pair(e):
 
 def test_recorded_boards_give_the_ranges_of_their_description(recorded):
     """Medians by an independent program (README of the data folder), of stamps of 40 bits over 20 s."""
-    found = load(recorded[90])
+    found = load(recorded(90))
     assert len(found.receptions["rx"]) == 1098
     named = {tag.tag: tag.body.removeprefix("0x") for tag in found.tags}
     known = {"853C-9042": 0.53, "853C-BB1E": 0.60, "853C-E621": 2.09, "9042-BB1E": -0.87, "9042-E621": 0.67}
@@ -147,7 +150,7 @@ def test_recorded_boards_give_the_ranges_of_their_description(recorded):
 
 def test_a_lossy_run_has_no_range_that_its_stamps_do_not_support(recorded):
     """Seven boards stand still, and one in forty of their stamps is wrong by up to 110 m."""
-    e = load(recorded[70]).exchanges
+    e = load(recorded(70)).exchanges
     assert len(e) > 0.96 * 496, "as many as there are with every stamp"
     pairs = by_pair(e)
     # 0x0E5F heard 0xCDA3 nine times, four or five of them wrong.
@@ -160,14 +163,14 @@ def test_a_lossy_run_has_no_range_that_its_stamps_do_not_support(recorded):
     assert np.ptp(e.time_ns) * 1e-9 == pytest.approx(28.5, abs=1)
 
 
-@pytest.mark.parametrize("run", [90, 110])
+@pytest.mark.parametrize("run", [90, pytest.param(110, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("first", [0, 1])
 def test_halves_of_a_run_agree_within_their_intervals(recorded, run, first):
     """A distance that nobody measured is in the constants of both halves, and cancels.
 
     In run 110 a board is warming up: by the rate of later frames alone its pairs would drift by 12 to 19 cm.
     """
-    e = load(recorded[run]).exchanges
+    e = load(recorded(run)).exchanges
     later = e.time_ns >= np.median(e.time_ns)
     halves = [
         calib.Ranges.from_arrays(
@@ -175,8 +178,7 @@ def test_halves_of_a_run_agree_within_their_intervals(recorded, run, first):
         )
         for h in (~later, later)
     ]
-    settings = calib.FitSettings(constants="pair", delays_only=True, between_m=0.0)
-    fitted = calib.fit(halves[first], settings)
+    fitted = calib.fit(halves[first], calib.FitSettings(constants="pair", delays_only=True, between_m=0.0))
     stage = calib.evaluate(halves[1 - first], fitted.calibration).to_dict()["overall"]
     assert abs(stage["full"]["median_m"]) < 0.02
     # Of 270 ranges 95 % and four standard errors, which count double, since errors last.
@@ -192,7 +194,7 @@ def test_halves_of_a_run_agree_within_their_intervals(recorded, run, first):
     ],
 )
 def test_a_geometry_that_was_made_up_is_refuted(recorded, tmp_path, run, use):
-    shutil.copy(recorded[run], tmp_path / "q.uwb")
+    shutil.copy(recorded(run), tmp_path / "q.uwb")
     (tmp_path / "grid.toml").write_text(
         "".join(f"[[anchors]]\nid = {k + 1}\nposition_m = [{k % 2}, {k // 2}, 1.0]\n" for k in range(7))
     )

@@ -312,7 +312,14 @@ def test_the_page_has_a_row_a_form():
     assert [row for row in rows if row in FORMS] == list(FORMS)
 
 
-@pytest.mark.parametrize("name", FORMS)
+RARER = (
+    "wide, `Distance 1`", "wide, `r_AN0`", "DWM1001 `les`", "AT+RANGE", "AT+RANGE with ids", "Arduino prints",
+    "TREK1000", "powers named `RSSI_fp`", "65535 for no range", "ids that are words",
+)  # fmt: skip
+"""Forms of which a sibling above is read in every run: the same kind of file with one more or one other property."""
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in RARER)) for name in FORMS])
 def test_a_form_comes_in_by_its_guess(tmp_path, name):
     form = FORMS[name]
     (tmp_path / "in").mkdir()
@@ -347,7 +354,7 @@ def imported(tmp_path, text, map_text="", name="t.csv"):
     return read_source(tmp_path / name, importer="csv", map_file=tmp_path / "map.toml" if map_text else None)
 
 
-@pytest.mark.parametrize("column", ["gt_range_m", "fpp1", "from_x_m"])
+@pytest.mark.parametrize("column", ["gt_range_m", pytest.param("fpp1", marks=pytest.mark.slow), "from_x_m"])
 def test_words_in_a_column_that_is_not_needed_are_named(tmp_path, column):
     """Half of its cells or more are refused; fewer are counted; empty ones and nan are nothing."""
 
@@ -367,7 +374,7 @@ def test_words_in_a_column_that_is_not_needed_are_named(tmp_path, column):
         assert len(imported(tmp_path, words, 'missing = ["WALL"]').exchanges) == 30
 
 
-@pytest.mark.parametrize("value", [0, -1, 65535, 9999.9])
+@pytest.mark.parametrize("value", [0, *(pytest.param(v, marks=pytest.mark.slow) for v in (-1, 65535)), 9999.9])
 def test_a_number_that_often_stands_for_no_range_is_refused_until_the_map_states_it(tmp_path, value):
     text = LONG + "".join(f"{k},1,2,{value if k % 5 == 0 else 3 + k / 7},\n" for k in range(60))
     with pytest.raises(ImportTableError, match=rf"20.0% of its numbers are {value}.* missing = \[{value}"):

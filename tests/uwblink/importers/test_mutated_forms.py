@@ -72,8 +72,7 @@ def mutated_long(rng, path):
 def mutated_wide(rng, path):
     unit, name = rng.choice(list(UNITS)), rng.choice(FAMILIES)
     name = name + ("" if unit.startswith("?") else unit)
-    rows = wide_rows(name, UNITS[unit])
-    return written(rng, path, rows, name.format(rng.randrange(4)))
+    return written(rng, path, wide_rows(name, UNITS[unit]), name.format(rng.randrange(4)))
 
 
 def mutated_stamps(rng, path):
@@ -112,8 +111,7 @@ def written(rng, path, rows, value):
         gone = rng.choice(list(rows[0]))
         rows = [{key: cell for key, cell in row.items() if key != gone} for row in rows]
     if rng.random() < 0.15:
-        summary = dict.fromkeys(rows[0], "") | {next(iter(rows[0])): "mean", value: 3.3}
-        rows = [*rows, summary]
+        rows = [*rows, dict.fromkeys(rows[0], "") | {next(iter(rows[0])): "mean", value: 3.3}]
     mark, comma = rng.choice([",", ";", "\t"]), rng.random() < 0.2
     text = (lambda v: str(v).replace(".", ",")) if comma and mark != "," else str
     return table(path.with_suffix(".csv"), rows, mark, rng.random() > 0.1, text)

@@ -34,8 +34,7 @@ def rows(numbers):
 
 
 def lines(path, head, table, mark=","):
-    text = [mark.join(map(str, cells)) for cells in [*head, *table]]
-    path.write_text("\n".join(text) + "\n")
+    path.write_text("\n".join([mark.join(map(str, cells)) for cells in [*head, *table]]) + "\n")
     return path
 
 

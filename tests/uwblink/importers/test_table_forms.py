@@ -219,8 +219,7 @@ def test_headers_that_two_columns_share_and_nobody_uses(tmp_path):
 
 def test_what_the_device_reported_is_kept_beside_the_stamps(tmp_path):
     rows = [{**row, "range_m": "" if k else 7.5} for k, row in enumerate(wrapped(flights()))]
-    found = read_rows(tmp_path, rows).exchanges
-    assert found.range_m[:2] == pytest.approx([7.5, flights()[1]["truth"]])
+    assert read_rows(tmp_path, rows).exchanges.range_m[:2] == pytest.approx([7.5, flights()[1]["truth"]])
 
 
 def test_no_time_at_all(tmp_path):
@@ -230,7 +229,7 @@ def test_no_time_at_all(tmp_path):
     assert any("no time" in note for note in found.meta["notes"])
 
 
-@pytest.mark.parametrize(("unit", "scale"), [("m", 1), ("mm", 1e3), ("in", 1 / 0.0254)])
+@pytest.mark.parametrize(("unit", "scale"), [("mm", 1e3), ("in", 1 / 0.0254)])
 def test_ranges_without_stamps_with_total_powers_and_places(tmp_path, unit, scale):
     anchor, rows = np.array([4.0, 1.0, 2.0]), []
     for k, place in enumerate(np.random.default_rng(4).normal(size=(30, 3))):
@@ -304,8 +303,7 @@ def test_a_message_that_got_lost_is_a_fault_not_another_exchange(tmp_path):
     lines = as_messages(wrapped(flights()))
     del lines[7]  # message 2 of the third exchange
     found = read_rows(tmp_path, lines, 'within_s = 0.1\n[columns]\nsequence = "seq"\n')
-    assert len(found.exchanges) == 59
-    assert [fault.detail.split(",")[0] for fault in found.faults] == ["row 8"]
+    assert (len(found.exchanges), [fault.detail.split(",")[0] for fault in found.faults]) == (59, ["row 8"])
 
 
 def test_two_rows_an_exchange(tmp_path):
@@ -318,21 +316,19 @@ def test_two_rows_an_exchange(tmp_path):
     assert stamps(e[np.argsort(e.time_ns)]) == [[row[n] % 2**32 for n in HEADER[3:9]] for row in rows]
 
 
-@pytest.mark.parametrize("name", ['a"; DROP TABLE x; --', "c0'); ATTACH 'evil.db'; --", "{0}?\\"])
-def test_a_hostile_name_of_a_column_is_a_name(tmp_path, name, monkeypatch):
+def test_hostile_names_of_columns_are_names(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    names = {"tx1": 'a"; DROP TABLE x; --', "rx1": "c0'); ATTACH 'evil.db'; --", "tx2": "{0}?\\"}
     rows = flights()
-    header = [name if n == "tx1" else n for n in HEADER]
+    table = [{names.get(n, n): row[n] for n in HEADER} for row in wrapped(rows)]
     with (tmp_path / "t.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([header, *([row[n] for n in HEADER] for row in wrapped(rows))])
-    same(read_table(tmp_path / "t.csv", mapped(tmp_path, f"[columns]\ntx1 = {json.dumps(name)}\n")), rows)
-    (tmp_path / "t.jsonl").write_text(
-        "\n".join(json.dumps(dict(zip(header, (row[n] for n in HEADER), strict=True))) for row in wrapped(rows)) + "\n"
-    )
-    same(read_table(tmp_path / "t.jsonl", tmp_path / "map.toml"), rows)
+        csv.writer(file).writerows([table[0], *(row.values() for row in table)])
+    (tmp_path / "t.jsonl").write_text("".join(json.dumps(row) + "\n" for row in table))
     with duckdb.connect() as db:
-        db.read_csv(str(tmp_path / "t.csv"), header=True).write_parquet(str(tmp_path / "t.parquet"))
-    same(read_table(tmp_path / "t.parquet", tmp_path / "map.toml"), rows)
+        db.read_csv("t.csv", header=True).write_parquet("t.parquet")
+    mapped(tmp_path, "[columns]\n" + "".join(f"{n} = {json.dumps(name)}\n" for n, name in names.items()))
+    for ending in ("csv", "jsonl", "parquet"):
+        same(read_table(tmp_path / f"t.{ending}", tmp_path / "map.toml"), rows)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.toml", "t.csv", "t.jsonl", "t.parquet"]
 
 
@@ -421,8 +417,7 @@ def test_files_that_cannot_be(tmp_path, name, content):
         read_table(tmp_path / name)
 
 
-@pytest.mark.parametrize("bits", [32, 40])
-@pytest.mark.parametrize(("counter", "low"), [("wrapped", 0), ("signed", -1)])
+@pytest.mark.parametrize(("bits", "counter", "low"), [(32, "wrapped", 0), (40, "signed", -1)])
 def test_the_first_stamp_that_a_counter_cannot_show_is_a_fault(tmp_path, bits, counter, low):
     lowest = low * 2 ** (bits - 1)
     rows = wrapped(flights(), bits - 1)
@@ -433,7 +428,7 @@ def test_the_first_stamp_that_a_counter_cannot_show_is_a_fault(tmp_path, bits, c
     assert [fault.detail.split(",")[0] for fault in found.faults] == ["row 7", "row 8"]
 
 
-@pytest.mark.parametrize(("unit", "scale"), [("s", 1), ("ms", 1e3), ("us", 1e6), ("ns", 1e9), ("iso", None)])
+@pytest.mark.parametrize(("unit", "scale"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9), ("iso", None)])
 def test_every_unit_of_times(tmp_path, unit, scale):
     rows = wrapped(flights())
     for k, row in enumerate(rows):

@@ -142,14 +142,14 @@ def test_single_sided_exchanges_have_none():
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory):
-    """The same five seconds of three boards, targets reporting too, and not."""
+    """The same 2.5 seconds of three boards, targets reporting too, and not."""
     folder = tmp_path_factory.mktemp("reports")
     for name, target_reports in (("both", True), ("one", False)):
         plan = uwblink.RangingPlan(rate_hz=60.0, target_reports=target_reports)
         lossy = VirtualPorts(bench_scenario(), lost_share=0.1)
-        record_bench(folder / f"{name}.board.uwb", plan, lossy, duration_s=5.0)
+        record_bench(folder / f"{name}.board.uwb", plan, lossy, duration_s=2.5)
         exchanges = exchanges_of(folder / f"{name}.board.uwb")
-        assert len(exchanges) > 200
+        assert len(exchanges) > 100
         measured = replace(exchanges, truth_m=np.full(len(exchanges), 3.0))
         rewritten(folder / f"{name}.board.uwb", folder / f"{name}.uwb", measured)
     return folder
@@ -169,7 +169,7 @@ def test_each_exchange_is_left_once(both):
     found = single_reports(exchanges)
     count = len(set(zip(exchanges.tx1.tolist(), exchanges.rx2.tolist(), strict=True)))
     assert (len(found.exchanges), len(found.differing)) == (count, 0)
-    assert found.repeated == len(exchanges) - count > 150
+    assert found.repeated == len(exchanges) - count > 75
     mine = found.exchanges.reporter == found.exchanges.initiator
     assert mine.all(), "every target's report follows one of the initiator's"
     one = exchanges_of(both / "one.uwb")
@@ -211,7 +211,7 @@ def test_show_calibration_and_doctor_count_it_once(both):
         failed = sum("failed" in fault.kind for fault in recording.faults())
     assert summary.counts["exchanges"] == sum(p.exchanges for p in summary.pairs) == len(exchanges)
     assert sum(p.failed for p in summary.pairs) == failed > 0
-    assert (summary.reported_twice > 150, summary.contradictory) == (True, 0)
+    assert (summary.reported_twice > 75, summary.contradictory) == (True, 0)
     assert len(calib.load_ranges(both / "both.uwb")) == len(exchanges)
     assert not any("contradicting" in finding.fault for finding in examine(both / "both.uwb"))
 

@@ -175,8 +175,7 @@ def test_a_range_is_at_somebody_else_s_20_ms_after_its_poll(ear):
         for found in uwblink.stream(list(ports.names.values()), duration_s=1.0, using=ports):
             assert isinstance(found, uwblink.StreamedRange)
             sender.send(found)
-            row = json.loads(ear.recv(65536))
-            assert row["timestamp"] == pytest.approx(found.time_ns * 1e-9, abs=1e-6)
+            assert json.loads(ear.recv(65536))["timestamp"] == pytest.approx(found.time_ns * 1e-9, abs=1e-6)
             late_ms.append((ports.host_ns() - found.time_ns) * 1e-6)
     assert len(late_ms) > 50
     assert 0 < min(late_ms) < max(late_ms) < 20

@@ -3,6 +3,7 @@
 import doctest
 import json
 import math
+import shutil
 import subprocess
 import time
 
@@ -23,7 +24,7 @@ from uwbsim.boards.virtual_board import VirtualPorts
 
 
 def flight(path, protocol="ds", **more):
-    record_bench(path, uwblink.RangingPlan(rate_hz=50.0, protocol=protocol), duration_s=4.0, **more)
+    record_bench(path, uwblink.RangingPlan(rate_hz=50.0, protocol=protocol), duration_s=2.0, **more)
     return uwblink.load(path).exchanges
 
 
@@ -64,8 +65,8 @@ def of_two(tmp_path_factory):
 
 def test_boards_are_streamed_as_they_would_be_recorded(flown):
     expected, seen = uwblink.load(flown).exchanges, Progress()
-    found = list(from_boards(duration_s=4.0, listeners=[seen]))
-    assert len(found) == len(expected) == seen.exchanges == pytest.approx(200, abs=2)
+    found = list(from_boards(duration_s=2.0, listeners=[seen]))
+    assert len(found) == len(expected) == seen.exchanges == pytest.approx(100, abs=2)
     for name in ("time_ns", "initiator", "target", "range_m", "fpp1_dbm", "skew2_ppm"):
         assert [getattr(one, name) for one in found] == getattr(expected, name).tolist()
     assert all(math.isnan(one.corrected_m) and math.isnan(one.sigma_m) for one in found)
@@ -150,7 +151,7 @@ def test_a_recording_plays_in_its_own_time(flown, clock):
     clock.clear()
     played = [(one.time_ns, math.fsum(clock)) for one in uwblink.stream(flown, speed=4.0)]
     assert [at for _, at in played] == pytest.approx([(when - played[0][0]) * 1e-9 / 4 for when, _ in played], abs=1e-9)
-    assert played[-1][1] == pytest.approx(1.0, abs=0.02)
+    assert played[-1][1] == pytest.approx(0.5, abs=0.02)
     assert max(clock) <= 0.1, "Ctrl-C is looked for ten times a second"
     assert len(list(uwblink.stream(flown, speed=math.inf, duration_s=1.0))) == pytest.approx(50, abs=2)
 
@@ -169,10 +170,10 @@ def test_what_cannot_be_is_said_before_the_first_range(flown, more, named):
         uwblink.stream(flown, **more)
 
 
-def test_ports_that_are_not_there_and_ranges_that_are_corrected_already(tmp_path, calibration):
+def test_ports_that_are_not_there_and_ranges_that_are_corrected_already(tmp_path, flown, calibration):
     with pytest.raises(PortError, match="no such port"):
         uwblink.stream(["/dev/nothing", "/dev/nobody"])
-    flight(tmp_path / "f.uwb")
+    shutil.copy(flown, tmp_path / "f.uwb")
     with uwblink.Recording.open(tmp_path / "f.uwb", update=True) as opened:
         opened.append_meta({"calibration": {}})
     with pytest.raises(ArgumentError, match="already corrected"):
@@ -294,8 +295,8 @@ def test_what_boards_overhear_is_streamed_with_the_ranges(overheard, tmp_path):
     ranges = [one for one in found if isinstance(one, uwblink.StreamedRange)]
     others = {(one.time_ns, one.initiator, one.target, one.listener): one for one in found if one not in ranges}
     assert len(ranges) == len(contents.exchanges)
-    assert len(others) == len(contents.overheard["time_ns"]) > 190
-    for row in range(0, len(others), 17):
+    assert len(others) == len(contents.overheard["time_ns"]) > 90
+    for row in range(0, len(others), 9):
         whose, raw, corrected = difference_of(contents, row, delays_ns)
         assert (others[whose].difference_m, others[whose].corrected_m) == pytest.approx((raw, corrected), abs=1e-6)
         # Five times the variance of a range where the clocks' rate is known without error, more with one from stamps.
@@ -303,7 +304,7 @@ def test_what_boards_overhear_is_streamed_with_the_ranges(overheard, tmp_path):
         assert others[whose].sigma_m == pytest.approx(5**0.5 * 0.05, rel=0.02)
     assert [one.time_ns for one in found] == sorted(one.time_ns for one in found)
     # Boards that are streamed give the same as their recording.
-    live = list(from_boards(calibration=path, use="receptions", duration_s=4.0))
+    live = list(from_boards(calibration=path, use="receptions", duration_s=2.0))
     assert sorted(map(str, live)) == sorted(map(str, found))
 
 

@@ -165,8 +165,7 @@ def test_any_broadcast_comes_back(data):
 @given(st.floats(-9999, 9999), st.integers(0, 2**32 - 1))
 def test_printed_numbers_are_cut_towards_zero(value, stamp):
     data = encode(m.RangeReport(1, value, stamp, 0, 0, 0, 0, 0, -90.0, -0.00001, 0.0, 1.5))
-    cut = abs(value) - abs(float(data.split(b"|")[2]))
-    assert -1e-9 <= cut < 1e-4 + 1e-9
+    assert -1e-9 <= abs(value) - abs(float(data.split(b"|")[2])) < 1e-4 + 1e-9
     assert b"|-0.0000|" in data
     assert [encode(message) for message in decode(data, m.REPORTS)] == [data]
 

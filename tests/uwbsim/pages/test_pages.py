@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import uwbsim
-from tests import processes
+from tests import pages, processes
 from tests.browser import lies_well
 from tests.shared_data import ROOT
 from uwblink import PROTOCOLS
+from uwblink.pages import figures
 from uwblink.pages.figures import picture, style
 from uwblink.ticks import METRES_PER_TICK
 from uwbsim.pages import write_sweep_page
@@ -82,8 +83,7 @@ def folder(tmp_path_factory):
     processes.succeed("uwbsim", "show", NLOS_OFFICE, "-o", folder / "scene.html")
     (folder / "out").mkdir()
     (folder / "out" / "compare.csv").write_text("old")
-    more = ["--force", "--json", "--figures", folder / "paper"]
-    done = processes.succeed("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 3000, *more)
+    done = processes.succeed("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 300, "--force", "--json")
     (folder / "told.json").write_text(done.stdout)
     return folder
 
@@ -107,13 +107,15 @@ def test_a_comparison_has_tables_and_json_and_takes_the_place_of_no_other(folder
     processes.refuse("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 10, naming=["--force"])
 
 
-def test_figures_for_a_paper_stand_in_a_folder_of_their_own(folder):
+def test_figures_for_a_paper_stand_in_a_folder_of_their_own_and_take_the_place_of_no_others(tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "drawn", pages.outline)
+    words = ["uwbsim", "compare", BENCH, "-n", 10, "--figures", tmp_path / "paper", "-o"]
+    processes.succeed(*words, tmp_path / "out")
     names = ("errors", "over-relative-skew-of-the-clocks", "over-delay-of-the-scheduled-message")
     files = {f"{name}-{form}" for name in names for form in ("page.svg", "page.pdf", "column.svg", "column.pdf")}
-    assert {path.name for path in (folder / "paper").iterdir()} == files
-    more = ["-n", 10, "--figures", folder / "paper"]
-    processes.refuse("uwbsim", "compare", BENCH, "-o", folder / "new", *more, naming=["paper", "--force"])
-    assert not (folder / "new").exists()
+    assert {path.name for path in (tmp_path / "paper").iterdir()} == files
+    processes.refuse(*words, tmp_path / "new", naming=["paper", "--force"])
+    assert not (tmp_path / "new").exists()
 
 
 def test_protocols_far_apart_are_drawn_about_their_medians_and_whole_half_ticks_as_one_hill():

@@ -179,7 +179,7 @@ def test_an_answer_leaves_at_the_first_grid_point_after_its_latency():
 )
 def test_what_is_one_event_ends_as_message_by_message(monkeypatch, plan, rate_hz, sync_error_ms):
     ranging = {"ranging.plan": plan, "ranging.rate_hz": rate_hz, "ranging.sync_error_ms": sync_error_ms}
-    scenario = load(TRAIN, {"run.duration_s": 20.0, "radio.sensitivity_dbm": -92.0} | ranging)
+    scenario = load(TRAIN, {"run.duration_s": 10.0, "radio.sensitivity_dbm": -92.0} | ranging)
     quick, single, plain = simulate(scenario), 0, air.Air._alone
 
     def counted(self, number, begin):
