@@ -200,7 +200,7 @@ def errors_of_readings(model: RangeModel, louder_m: Floats) -> Floats | None:
 
 
 def distance_speeds(model: RangeModel) -> Floats:
-    """Return the rate of change of the true distance of each range (n,), in m/s, from neighbouring ranges of its pair."""
+    """Return the rate of change (n,) of the true distance of each range, in m/s, from neighbours of its pair."""
     ranges, pair = model.ranges, model.pairs.number
     order = np.argsort(pair, kind="stable")
     time_s, truth_m = ranges.time_ns[order] * 1e-9, ranges.truth_m[order]
