@@ -157,6 +157,8 @@ def _turns(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]:
     told = [_with_arms(view.tags, dict.fromkeys(arms, tip)) for tip in np.eye(4, 3, -1)]
     place, *tips = (np.stack([antennas_m(view.poses, tags, ids, e.time_ns) for ids in ends.T], 1) for tags in told)
     axes = np.stack(tips, axis=-1) - place[..., None]
+    # Rotations that turn axes into each other: searches for any turn begin at the best.
+    turns = [*Rotation.create_group("O").as_rotvec()]
     given_m = _antennas(np.zeros(3), place, axes, arm)
     measured_m = _apart_m(given_m) + fit.error[every]
     for body in ("", *sorted({tag.body for tag in view.tags} - places_m(view).keys())):
@@ -166,7 +168,7 @@ def _turns(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]:
         def away_m(x: Floats, antennas: Callable[[Floats], Floats] = antennas) -> Floats:
             return _apart_m(antennas(x))
 
-        x = _best(away_m, measured_m, pair, [*AXES_EXCHANGED])
+        x = _best(away_m, measured_m, pair, turns)
         turn, tags, attitude = Rotation.from_rotvec(x), view.tags, view.poses.quaternion
         if np.linalg.norm(antennas(x) - given_m, axis=2).max() <= 2 * TOLERANCE_M:
             continue
@@ -184,10 +186,6 @@ def _turns(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]:
         evidence = f"with {what} turned by {angle:.0f} degrees about {axis}"
         seen = Candidate("attitudes in another frame", evidence, words={"remedy": remedy})
         yield seen, replace(view.poses, quaternion=attitude), tags
-
-
-AXES_EXCHANGED: Final = Rotation.create_group("O").as_rotvec()
-"""Rotation vectors (24, 3) that turn the axes of a frame into each other: searches for any turn begin at the best."""
 
 
 def _apart_m(antennas_m: Floats) -> Floats:

@@ -121,13 +121,12 @@ def _rates(e: Exchanges, heard: Mapping[str, NDArray[Any]], between_s: Any) -> t
     and at the listener; with two messages from the listener's carrier integrator.
     """
     third = {name: PROTOCOLS[name].third_sender for name in np.unique(e.protocol).tolist()}
-    by_target, by_initiator = (np.array([third[p] == who for p in e.protocol.tolist()], bool) for who in _ROLES)
+    by_target, by_initiator = (
+        np.array([third[p] == who for p in e.protocol.tolist()], bool) for who in ("target", "initiator")
+    )
     own = np.where(by_target, elapsed(e.tx3, e.tx2, e.bits), elapsed(e.rx3, e.rx1, e.bits))
     at_listener = elapsed(heard["rx3"], np.where(by_target, heard["rx2"], heard["rx1"]), e.bits)
     with np.errstate(divide="ignore", invalid="ignore"):
         by_stamps, stretch = own / at_listener, between_s / TICK_S / at_listener
     rate = np.where(by_target | by_initiator, by_stamps, 1 / (1 + heard["skew2_ppm"] * 1e-6))
     return rate, np.where(by_target, stretch, np.where(by_initiator, -stretch, 0.0))
-
-
-_ROLES: Final = ("target", "initiator")

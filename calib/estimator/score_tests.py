@@ -28,9 +28,6 @@ SAME = 0.95
 """Alternatives whose tests correlate by more than this cannot be distinguished: a fault of ten standard errors in one
 appears as 9.5 in the other, a difference of 1.6 standard deviations."""
 
-MOST_NAMED = 3
-"""Maximum number of alternatives of a family that are found one after the other: faults are few."""
-
 
 @dataclass(frozen=True, slots=True)
 class Derivative:
@@ -271,7 +268,8 @@ def findings(tested: Tested, several: int, rate: float, tolerance_m: float = 0.0
     Offsets up to the tolerance are no finding.
     """
     family, freedom = tested.family, max(tested.lasting.freedom, 3.0)
-    for _ in range(MOST_NAMED):
+    # At most three alternatives are found one after the other: faults are few.
+    for _ in range(3):
         total, covariance, information = tested.total, tested.covariance, tested.information
         std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         known = np.diag(information) > REACHED * tested.whole
