@@ -136,8 +136,8 @@ class Evaluation:
         return as_html(TITLE, self._rows()) + notebook_image(draw, "errors by pair, raw and corrected")
 
     def _rows(self) -> list[list[str]]:
-        above = ["", "", "raw", "", "", "delay", "", "", "full", "", "", *(column[0] for column in COLUMNS)]
-        head = ["pair", "n", *3 * ["mean", "med.", "rob."], *(column[1] for column in COLUMNS)]
+        above = ["", "", "raw", "", "", "delay", "", "", "full", "", "", *(column[0] for column in ERROR_COLUMNS)]
+        head = ["pair", "n", *3 * ["mean", "med.", "rob."], *(column[1] for column in ERROR_COLUMNS)]
         return [
             above,
             head,
@@ -169,7 +169,7 @@ def stage_cells(group: ErrorStatistics) -> list[str]:
     return [str(group.raw.n), *(f"{100 * error:.1f}" for error in errors_m)]
 
 
-COLUMNS: Final[tuple[tuple[str, str, str, Callable[[ErrorStatistics], str]], ...]] = (
+ERROR_COLUMNS: Final[tuple[tuple[str, str, str, Callable[[ErrorStatistics], str]], ...]] = (
     ("chi2", "out%", "per cent that chi-square rejects at 95 %", lambda group: f"{100 * group.rejected:.1f}"),
     ("total", "z std", "standard deviation over the total sigma", lambda group: f"{group.total_std:.2f}"),
     ("in", "95%", "per cent within their 95 % interval", lambda group: f"{100 * group.inside_95:.1f}"),
@@ -180,13 +180,13 @@ group. A new statistic is a field of `ErrorStatistics`, its value in `_group`, a
 TITLE: Final = "; ".join(
     [
         "Range errors in cm: mean, median and robust standard deviation, raw, with delays and fully corrected",
-        *(column[2] for column in COLUMNS),
+        *(column[2] for column in ERROR_COLUMNS),
     ]
 )
 
 
 def _cells(group: ErrorStatistics) -> list[str]:
-    cells = [*stage_cells(group), *(column[3](group) for column in COLUMNS)]
+    cells = [*stage_cells(group), *(column[3](group) for column in ERROR_COLUMNS)]
     return ["-" if "nan" in cell else cell for cell in cells]
 
 

@@ -1,6 +1,7 @@
 """The estimator by what a contributor writes: an unknown, a part and a kind of row of one's own, and an oracle."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ def climbed():
     warm = replace(cold, raw_m=cold.raw_m + PER_KELVIN_M * temperature_at(cold.time_ns))
 
     def climb(slope, slope_std):
-        names = {"__name__": "example", "ranges": warm, "temperature_at": temperature_at}
+        names: dict[str, Any] = {"__name__": "example", "ranges": warm, "temperature_at": temperature_at}
         names |= {"slope": slope, "slope_std": slope_std}
         exec(EXAMPLE, names)  # noqa: S102 - the page is our own
         found, at = names["found"], names["layout"].where["warmth"].start

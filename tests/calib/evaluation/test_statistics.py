@@ -107,7 +107,7 @@ def test_a_figure_has_the_errors_of_each_pair_and_of_many_pairs_the_farthest(fou
 
 def test_one_more_column_is_one_row(monkeypatch):
     row = ("full", "95 % |e|", "quantile of absolute errors", lambda group: f"{group.full.abs95_m:.3f}")
-    monkeypatch.setattr(statistics, "COLUMNS", (*statistics.COLUMNS, row))
+    monkeypatch.setattr(statistics, "ERROR_COLUMNS", (*statistics.ERROR_COLUMNS, row))
     flight = calib.load_ranges(calib.sample_flight())
     found = calib.evaluate(flight, calib.fit(flight))
     _, above, head, *rows = repr(found).splitlines()
