@@ -256,7 +256,8 @@ def planted_difference(result, loaded):
 def test_a_frame_is_read_with_its_columns_in_words_of_their_owner(form):
     whole = frame(gt_range_m=1000 * frame().gt_range_m)
     loaded = calib.Ranges.from_dataframe(form(whole), MAP)
-    assert (len(loaded), loaded.truth_m) == (N, pytest.approx(whole.gt_range_m / 1000))
+    assert len(loaded) == N
+    assert loaded.truth_m == pytest.approx(whole.gt_range_m / 1000)
     assert loaded.raw_m == pytest.approx(whole.distance_mm / 1000)
     assert loaded.fpp2_dbm == pytest.approx(whole.fpp_dbm)
     assert np.diff(loaded.time_ns) == pytest.approx(50_000_000)

@@ -278,7 +278,7 @@ def test_the_filter_knows_what_listeners_of_an_exchange_share(known, monkeypatch
         return {"raw": apart, "variance": FilterRanges(measured, own, common, nothing)}
 
     monkeypatch.setattr(team, "filter_ranges", drawn)
-    ungated, flights = replace(LISTEN, gate=1e9), [simulated(seed, 4.0) for seed in seeds]
+    ungated, flights = replace(LISTEN, gate=1e9), [simulated(seed, 6.0) for seed in seeds]
     figures = team_json([one for each in flights for one in calib.localize_team(each, known, ungated)])["summary"]
     assert 4.5 < figures["variance"]["nees"] < 7
     assert figures["raw"]["nees"] > 1.3 * figures["variance"]["nees"]
