@@ -149,8 +149,8 @@ FORMS = {
 }
 
 
-RARER = ("Range without a tag", "numbers", "fields, and Range")
-"""Forms of which a sibling above or below is read in every run."""
+RARER = ("Range in ROS 1", "Range without a tag", "numbers", "fields, and Range")
+"""Forms of which a sibling is read in every run, here or by another test of this folder."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in RARER)) for name in FORMS])
@@ -243,7 +243,7 @@ def recorded(tmp_path):
     return held
 
 
-@pytest.mark.parametrize("to", ["rosbag2", "mcap"])
+@pytest.mark.parametrize("to", ["rosbag2", pytest.param("mcap", marks=pytest.mark.slow)])
 def test_our_own_bags_come_in_without_a_map_and_with_powers(tmp_path, recorded, to):
     export_recording(tmp_path / "r.uwb", tmp_path / "out", to=to)
     bag = tmp_path / "out" / ("rosbag2" if to == "rosbag2" else "recording.mcap")

@@ -314,9 +314,10 @@ def test_the_page_has_a_row_a_form():
 
 RARER = (
     "wide, `Distance 1`", "wide, `r_AN0`", "DWM1001 `les`", "AT+RANGE", "AT+RANGE with ids", "Arduino prints",
-    "TREK1000", "powers named `RSSI_fp`", "65535 for no range", "ids that are words",
+    "TREK1000", "powers named `RSSI_fp`", "65535 for no range", "times of flight in ns", "decimal commas",
+    "logs of both ends", "ids that are words",
 )  # fmt: skip
-"""Forms of which a sibling above is read in every run: the same kind of file with one more or one other property."""
+"""Forms of which a sibling is read in every run, here or by another test of this folder: the same kind of file."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in RARER)) for name in FORMS])

@@ -280,8 +280,8 @@ def as_messages(rows, third="target"):
 @pytest.mark.parametrize(
     ("third", "without"),
     [
-        ("target", ()), ("initiator", ("seq",)), ("target", ("message",)), ("initiator", ("seq", "message")),
-        ("initiator", ("time_s",)),
+        ("target", ()), ("initiator", ("seq", "message")), ("initiator", ("time_s",)),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("initiator", ("seq",)), ("target", ("message",)))),
     ],
 )  # fmt: skip
 def test_a_row_a_message(tmp_path, third, without):

@@ -185,7 +185,7 @@ def test_a_target_s_report_stands_where_the_initiator_s_is_missing(both):
     assert np.count_nonzero(found.exchanges.reporter == found.exchanges.target) == 1
 
 
-@pytest.mark.parametrize("name", ["range_m", "tx1", "rx3", "skew2_ppm"])
+@pytest.mark.parametrize("name", ["range_m", "tx1", "tx2", "rx3", "skew2_ppm"])
 def test_a_difference_is_found_whichever_number_it_is_in(both, name):
     exchanges = exchanges_of(both / "both.uwb")
     row = np.flatnonzero(exchanges.reporter == exchanges.target)[7]
