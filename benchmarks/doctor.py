@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 import calib
 from benchmarks.flights import FIRST_REPORTED, LIGHT, TICKS, Flight, Plan, fly
+from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Fault
 from uwbsim import simulate
 from uwbsim.scenario.loading import load
@@ -207,6 +208,13 @@ def late_poses(flight: Flight, rng: np.random.Generator) -> Flight:
     """Let the clock of the poses be off."""
     shift = int(rng.choice([-1, 1]) * rng.uniform(0.15, 1.5) * 1e9)
     return replace(flight, poses=replace(flight.poses, time_ns=flight.poses.time_ns + shift))
+
+
+def late_truths(flight: Flight, by_ns: int) -> Flight:
+    """Give true distances in the table, of a time that is later by so much, and no poses."""
+    e = flight.exchanges
+    truth_m = distances_m(flight.poses, flight.tags, e.initiator, e.target, e.time_ns + by_ns)
+    return replace(changed(flight, truth_m=truth_m), poses=flight.poses[:0])
 
 
 def dead(flight: Flight, rng: np.random.Generator) -> Flight:
@@ -432,6 +440,9 @@ FAULTS: Final = (
     Case("`rx2` rounded to 10⁷", BASE, lambda f, _: changed(f, rx2=f.exchanges.rx2 // 10**7 * 10**7),
          names("impossible stamps")),
     Case("poses 0.15 to 1.5 s off", BASE, late_poses, names("pose time offset")),
+    Case("true distances 0.15 to 0.6 s off, without poses", BASE,
+         lambda f, rng: late_truths(f, int(rng.choice([-1, 1]) * rng.uniform(0.15, 0.6) * 1e9)),
+         names("time offset of true distances")),
     Case("vacuum's speed of light", BASE, lambda f, _: changed(f, range_m=f.exchanges.range_m * VACUUM),
          names("speed of light in vacuum")),
     Case("a delay steps by 0.3 to 1.2 ns", BASE, stepped, names("delay changed mid-flight")),

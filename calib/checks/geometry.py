@@ -42,7 +42,9 @@ def pose_clock(view: RecordingView) -> Iterator[Candidate]:
             late_s, p_value, _ = fit.offset(speeds, tolerance=0.0 if posed else CLOCKS_S)
     if not posed:
         way = "later" if late_s < 0 else "earlier"
-        evidence = f"ranges differ from the true distances as if these were those {abs(late_s):.2f} s {way}"
+        evidence = (
+            f"errors follow the speeds of distances, as if each true distance were the one {abs(late_s):.2f} s {way}"
+        )
         yield Candidate("time offset of true distances", evidence, p_value, words={"shift": f"{-late_s:+.2f}"})
     if not posed or p_value > BUDGET:
         return

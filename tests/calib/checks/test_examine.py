@@ -14,7 +14,6 @@ import uwbsim
 from benchmarks import doctor as planted
 from benchmarks.flights import LIGHT, Plan, fly
 from uwblink import Contents
-from uwblink.recording.distances import distances_m
 
 pytestmark = pytest.mark.slow
 
@@ -87,14 +86,7 @@ def late_poses(by_ns):
 
 
 def late_truths(by_ns):
-    """True distances in the table, of a time that is later by so much, and no poses."""
-
-    def plant(f, _):
-        e = f.exchanges
-        truth_m = distances_m(f.poses, f.tags, e.initiator, e.target, e.time_ns + by_ns)
-        return replace(f, exchanges=replace(e, truth_m=truth_m), poses=f.poses[:0])
-
-    return plant
+    return lambda f, _: planted.late_truths(f, by_ns)
 
 
 def simulated(*settings):
