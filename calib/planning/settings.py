@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from calib.errors import BadInputError
 from calib.settings import CheckedSettings, check_choice
+from uwblink.display import first_few
 from uwblink.settings import setting
 
 ROOMS_M: Final = {"line": (5.0,), "plane": (3.0, 2.0), "space": (6.0, 5.0, 2.5)}
@@ -115,7 +116,7 @@ class SurveyPlanSettings(CheckedSettings):
         several = 2 <= len(tags) <= 30 and len(set(tags)) == len(tags)
         strangers = [tag for tag in sorted(self.anchors) if tags and tag not in tags]
         refused = [
-            ("boards", tags and not several, f"found {tags!r:.60}, expected 2 to 30 boards, each once"),
+            ("boards", tags and not several, f"found {first_few(map(str, tags))}, expected 2 to 30 boards, each once"),
             ("anchors", strangers, "{1[0]} is none of the boards"),
             ("anchors", self.anchors and self.on == "line", on_line),
             ("size_m", wrong_size, f"found {{}}, expected as many lengths in metres as dimensions, {self.dimensions}"),
