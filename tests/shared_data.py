@@ -22,8 +22,13 @@ def shared(name):
 def rows_of(name, ending):
     """Return the rows, by their headers, of all tables of an archive whose names end so."""
     with tarfile.open(shared(name)) as archive:
-        files = [archive.extractfile(one) for one in archive.getnames() if one.endswith(ending)]
-        return [row for file in files if file for row in DictReader(TextIOWrapper(file))]
+        # In the order of the archive, which is decompressed once then.
+        return [
+            row
+            for member in archive
+            if member.name.endswith(ending) and (file := archive.extractfile(member))
+            for row in DictReader(TextIOWrapper(file))
+        ]
 
 
 def miluv(folder):
