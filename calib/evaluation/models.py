@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -62,10 +62,6 @@ def delay_states(filters: Sequence[FilterRanges]) -> DelayStates:
     return next((one.delays for one in filters if one.delays.tags), FIXED_DELAYS)
 
 
-LEAST_ODDS: Final = 1e-3
-"""Minimum ratio of a model's probability to the largest one, so that delays may begin to drift late in a flight."""
-
-
 class ModelAverage:
     """Averages over filters and their rivals by probability: one for each filter that is `shown`.
 
@@ -77,7 +73,8 @@ class ModelAverage:
         """Begin without innovations of filters (filters, *shape)."""
         self.shown = [f for f, one in enumerate(known) if one.shown]
         rivals = np.array([[0 <= f - k <= known[f].rivals for k in range(len(known))] for f in self.shown])
-        self.least = np.where(rivals, np.log(LEAST_ODDS), -np.inf).reshape(*rivals.shape, *(1 for _ in shape))
+        # No model is a thousand times less probable than another, so that delays may begin to drift late in a flight.
+        self.least = np.where(rivals, -np.log(1000.0), -np.inf).reshape(*rivals.shape, *(1 for _ in shape))
         self.log_odds = np.broadcast_to(np.where(np.isinf(self.least), -np.inf, 0.0), (*rivals.shape, *shape))
         self.drifting = np.array([len(one.delays.tags) > 0 for one in known])
         self.offset = np.array([one.offset_m > 0 for one in known])
