@@ -155,10 +155,10 @@ def inverse_attitudes(flight: Flight, rng: np.random.Generator) -> Flight:
 
 
 def turned_attitudes(flight: Flight, rng: np.random.Generator, *, body: str = "") -> Flight:
-    """Turn the attitudes in the world by 30 to 180 degrees, or those of a body about the vertical of its own frame."""
-    # About the line through its tags a body may be turned as one likes.
+    """Turn the attitudes in the world by 30 to 150 degrees, or those of a body about the vertical of its own frame."""
+    # A turn about the line through the tags of a body changes nothing; one by 180 degrees exchanges the tags.
     axis, given = np.array([0.0, 0.0, 1.0]) if body else rng.normal(size=3), Rotation.from_quat(flight.poses.quaternion)
-    turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(np.pi / 6, np.pi))
+    turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(np.pi / 6, 5 * np.pi / 6))
     turned = (given * turn if body else turn * given).as_quat()
     mine = (flight.poses.body == body)[:, None] | (body == "")
     return replace(flight, poses=replace(flight.poses, quaternion=np.where(mine, turned, flight.poses.quaternion)))
@@ -427,7 +427,7 @@ FAULTS: Final = (
     Case("lever arms of a body with the wrong sign", BASE, turned_arms, names("lever arm sign", "swapped tag ids")),
     Case("quaternions w x y z", BASE, wxyz, names("wxyz quaternion")),
     Case("from world to body", BASE, inverse_attitudes, names("inverse quaternion")),
-    Case("turned by 30 to 180 degrees in the world", BASE, turned_attitudes, names("attitudes in another frame")),
+    Case("turned by 30 to 150 degrees in the world", BASE, turned_attitudes, names("attitudes in another frame")),
     Case("those of a body about its vertical", BASE, partial(turned_attitudes, body="drone2"),
          names("attitudes in another frame")),
     Case("of a tag, with the wrong sign", BASE, turned_arm, names("wrong lever arm")),

@@ -213,17 +213,19 @@ def _with_arms(tags: list[Tag], arms: dict[int, Floats]) -> list[Tag]:
 
 
 def geometry(view: RecordingView) -> Iterator[Candidate]:
-    """Find the fault of geometry that explains the ranges best, by trying all suspected ones."""
-    for suspected in ((_trials,), (_displacements, _turns)) if view.posed else ():
-        e, trials = view.exchanges, [one for some in suspected for one in some(view)]
-        found = [
-            _with_spreads(view, seen, distances_m(poses, tags, e.initiator, e.target, e.time_ns), tried=len(trials))
-            for seen, poses, tags in trials
-        ]
-        # If a simple fault explains the ranges, positions need not be fitted.
-        if sure := [one for one in found if one.p_value < BUDGET]:
-            yield max(sure, key=lambda one: one.gain)
-            return
+    """Find the fault of geometry that explains the ranges best, by trying all suspected ones.
+
+    A fault with fitted unknowns must explain a twentieth more than one without, which may be a case of it.
+    """
+    weighted = ((_trials, 1.0), (_displacements, 0.95), (_turns, 0.95)) if view.posed else ()
+    trials, e = [(weight, *one) for suspected, weight in weighted for one in suspected(view)], view.exchanges
+    found = []
+    for weight, seen, poses, tags in trials:
+        true_m = distances_m(poses, tags, e.initiator, e.target, e.time_ns)
+        tested = _with_spreads(view, seen, true_m, tried=len(trials))
+        found.append(replace(tested, gain=weight * tested.gain))
+    if sure := [one for one in found if one.p_value < BUDGET]:
+        yield max(sure, key=lambda one: one.gain)
 
 
 def _with_spreads(view: RecordingView, seen: Candidate, truth_m: Floats, *, tried: int = 1) -> Candidate:
