@@ -179,8 +179,8 @@ def _turns(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]:
             lines = "".join(_line(view, tag) for tag in tags if tag.tag in mine)
             remedy = f"measure the lever arms in the frame of the poses of {body}; the ranges give{lines}"
         else:
-            attitude = np.where(attitude.any(axis=1, keepdims=True), attitude, [0.0, 0.0, 0.0, 1.0])
-            attitude = (turn * Rotation.from_quat(attitude)).as_quat()
+            attitude, known = attitude.copy(), np.linalg.norm(attitude, axis=1) > 0
+            attitude[known] = (turn * Rotation.from_quat(attitude[known])).as_quat()
             factor = turn.as_quat().round(3).tolist()
             remedy = f"turn them into the frame of the positions: multiply each from the left by x y z w = {factor}"
         what, angle = f"the lever arms of {body}" if body else "all attitudes", np.degrees(turn.magnitude())

@@ -85,6 +85,13 @@ def late_poses(by_ns):
     return lambda f, _: replace(f, poses=replace(f.poses, time_ns=f.poses.time_ns + by_ns))
 
 
+def turned_with_gaps(flight, rng):
+    """Turned attitudes, some of which are unknown: NaN, or zero."""
+    quaternion = planted.turned_attitudes(flight, rng).poses.quaternion
+    quaternion[::50], quaternion[1::50] = np.nan, 0.0
+    return replace(flight, poses=replace(flight.poses, quaternion=quaternion))
+
+
 def late_truths(by_ns):
     return lambda f, _: planted.late_truths(f, by_ns)
 
@@ -136,6 +143,7 @@ UNREAD = "single-sided without carrier readings"
         (SHORT, planted.wxyz, "wxyz quaternion", ""),
         (SHORT, planted.inverse_attitudes, "inverse quaternion", "signs of x y z"),
         (SHORT, planted.turned_arm, "wrong lever arm", "lever_arm_m"),
+        (SHORT, turned_with_gaps, "attitudes in another frame", "from the left"),
         (SHORT, partial(planted.turned_attitudes, body="drone2"), "attitudes in another frame", "lever_arm_m"),
         (replace(SHORT, seconds=120), planted.other_origin, "body stands elsewhere", r"0\.7\d m away \(-0\.0\d, -0\.7"),
         (replace(SHORT, bits=40), planted.clock_set_back, "recordings mixed by their times", ""),
