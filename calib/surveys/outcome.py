@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from calib.calibration.model import Calibration, Uncertainty, matrix_of
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis, flat_curve
 from calib.errors import UnanswerableError
 from calib.estimator.range_model import METRES_A_NS
-from calib.findings import Finding
+from calib.findings import Finding, for_provenance, warning
 from calib.information import InformationColumn, Verdict, judge, reduced
 from calib.settings import SurveySettings
 from calib.spread import TWO_SIDED_95
@@ -70,14 +70,13 @@ def result_of(
             undetermined=[[int(tag) for tag in free]],
         )
     reflected = tuple(_reflected_pairs(found))
-    warnings = (*data.warnings, *map(str, findings), *_notes(found, second, verdict, reflected))
+    findings = (*data.limits, *findings, *_limits(found, second, verdict, reflected))
     arrangements = tuple(_arrangement(found, k) for k in range(len(network.arrangements)))
     more = ({"settings": asked.changed()} if asked.changed() else {}) | {
         "surveyed": [one.to_dict() for one in arrangements],
         "reflected": [one.to_dict() for one in reflected],
-        "findings": list(map(str, findings)),
         "second_best": None if second is None else round(second.worse, 2),
-        "warnings": list(warnings),
+        **for_provenance(findings),
     }
     return SurveyResult(
         calibration=_calibration(data, found, verdict, taken, more),
@@ -85,8 +84,7 @@ def result_of(
         verdict=verdict,
         pair_error_m=found.case.pair_m,
         second_best=second,
-        contradictions=findings,
-        warnings=warnings,
+        findings=findings,
         reflected=reflected,
     )
 
@@ -102,47 +100,41 @@ def _reflected_pairs(found: Solution) -> list[ReflectedPair]:
     ]
 
 
-def _notes(
+def _limits(
     found: Solution, second: SecondBest | None, verdict: Verdict, reflected: Sequence[ReflectedPair]
-) -> list[str]:
-    """Return the warnings of a survey, one line each."""
-    believed = [one for one in reflected if one.believed]
-    perhaps = ", ".join(
-        f"{one.first}-{one.second} in {one.arrangement} ({100 * one.chance:.0f} %)"
-        for one in reflected
-        if not one.believed
-    )
-    where, who, worse = ("", (), 0.0) if second is None else (second.arrangement, second.tags, second.worse)
-    notes = [
-        *(
-            (
-                True,
+) -> Iterator[Finding]:
+    """Yield the limits of a survey."""
+    for one in reflected:
+        if one.likely:
+            yield warning(
+                "reflections of a pair",
                 f"{one.arrangement}: the range of {one.first} and {one.second} is {100 * one.longer_m:+.0f} cm too "
                 f"long compared with all others: probably reflected ({100 * one.chance:.0f} %), so it has little "
                 f"weight",
             )
-            for one in believed
-        ),
-        (perhaps, f"may also be reflected: {perhaps}; intervals are widened for this"),
-        (not found.settled, "the search stopped before it converged: delays and positions are not final"),
-        (
-            verdict.free,
-            f"not determined: {'; '.join(verdict.free)}"
-            + f"; left out: tags {', '.join(verdict.named('delay'))}" * bool(verdict.named("delay")),
-        ),
-        (
-            found.network.curve is not None,
+    perhaps = [one for one in reflected if not one.likely]
+    if perhaps:
+        named = (f"{one.first}-{one.second} in {one.arrangement} ({100 * one.chance:.0f} %)" for one in perhaps)
+        text = f"may also be reflected: {', '.join(named)}; intervals are widened for this"
+        yield warning("reflections of a pair", text)
+    if not found.settled:
+        yield warning("not converged", "the search stopped before it converged: delays and positions are not final")
+    if verdict.free:
+        delays = ", ".join(verdict.named("delay"))
+        text = f"not determined: {'; '.join(verdict.free)}" + f"; left out: tags {delays}" * bool(delays)
+        yield warning("undetermined delays", text)
+    if found.network.curve is not None:
+        yield warning(
+            "common part of delays",
             "a constant of the curve and a common shift of all delays cannot be separated by ranges: the common part "
-            "of the delays is only known as well as the curve at its reference power. Differences of delays are "
-            "known better, and a measured distance (`known`) determines the common part",
-        ),
-        (
-            second is not None and second.ambiguous,
-            f"{where}: another solution agrees with the ranges as well (worse by {worse:.1f}), with other positions "
-            f"of boards {', '.join(map(str, who))}",
-        ),
-    ]
-    return [text for needed, text in notes if needed]
+            "of the delays is only known as well as the curve at its reference power, differences of delays better",
+        )
+    if second is not None and second.ambiguous:
+        yield warning(
+            "two solutions of a survey",
+            f"{second.arrangement}: another solution agrees with the ranges as well (worse by {second.worse:.1f}), "
+            f"with other positions of boards {', '.join(map(str, second.tags))}",
+        )
 
 
 def _calibration(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import PurePath
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, special
 
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.data.ranges import Ranges, concatenate
@@ -22,7 +22,7 @@ from calib.estimator.optimize import LONGER, maximize
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, Part
 from calib.estimator.unknowns import Prior, Priors, Unknown
-from calib.findings import Finding
+from calib.findings import Finding, warning
 from calib.pairs import Pairs, pairs_of
 from calib.settings import FitSettings
 from calib.spread import STD_OF_MEDIAN, medians, robust_spread
@@ -70,14 +70,14 @@ class PairMeans(ColumnTable):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyData:
-    """Means of pairs, the arrangements by their numbers, distances in recordings, and warnings."""
+    """Means of pairs, the arrangements by their numbers, distances in recordings, contradictions and limits."""
 
     means: PairMeans
     arrangements: tuple[Arrangement, ...]
     distances: tuple[KnownDistance, ...]
     sources: tuple[str, ...]
     findings: tuple[Finding, ...]
-    warnings: tuple[str, ...]
+    limits: tuple[Finding, ...]
     antenna_delays: AntennaDelays
 
 
@@ -102,13 +102,14 @@ def read_surveys(data: Data | Iterable[Data], knowledge: Knowledge) -> SurveyDat
             arrangements[one.name] = one
     whole = concatenate([ranges for ranges, _, _ in recordings])
     means, few = pair_means(whole, np.concatenate(numbers))
+    text = f"{few} pairs of an arrangement have less than 5 ranges and are left out"
     return SurveyData(
         means=means,
         arrangements=tuple(arrangements.values()),
         distances=tuple(distance for _, _, stated in recordings for distance in stated),
         sources=tuple(ranges.source for ranges, _, _ in recordings),
         findings=tuple(findings),
-        warnings=(f"{few} pairs of an arrangement have less than 5 ranges and are left out",) if few else (),
+        limits=(warning("few ranges of a pair", text),) if few else (),
         antenna_delays=whole.antenna_delays,
     )
 
@@ -216,12 +217,15 @@ def find_motion(name: str, ranges: Ranges) -> list[Finding]:
     mine = changed[:, edge] & (member[board] > 0)
     by_m = float(np.abs(step[mine, edge]).max())
     # Medians of short spans determine the time better than medians of long ones.
-    edge = np.argmax(np.nan_to_num(np.abs(_steps(median, WINDOW_BINS)[mine, 1:-1])).sum(axis=0))
+    at, edge = edge, np.argmax(np.nan_to_num(np.abs(_steps(median, WINDOW_BINS)[mine, 1:-1])).sum(axis=0))
     text = (
         f"{name}: board {tag} was moved {(starts[edge + 1] - begin) * 1e-9:.0f} s after the start (ranges changed by "
         f"up to {100 * by_m:.0f} cm)"
     )
-    return [Finding("board moved within an arrangement", text, "record that arrangement again, or end it before", 0.0)]
+    # At least two pairs changed at one of all edges.
+    second = float(np.sort(size[mine, at])[-2])
+    p_value = min(1.0, 2 * size.size * float(special.ndtr(-second)))
+    return [warning("board moved within an arrangement", text, p_value)]
 
 
 def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:

@@ -137,7 +137,7 @@ def tapes_of(
         if not times:
             left_out.append(
                 f"the distance of tags {one.first} and {one.second} is not used, because it is unknown when its "
-                f"bodies stood still; give an arrangement or its seconds"
+                f"bodies stood still"
             )
             continue
         std_m = one.sigma_m * np.sqrt(len(times))

@@ -183,7 +183,7 @@ def _second_solution(scene: Scene, best: MotionFit, tried: list[MotionFit], time
             what = f"{scene.moving[int(np.argmax(away))]} {away.max():.1f} m away" if given else "other distances"
             return (
                 f"a second solution, with {what}, fits the first {time[-1] - time[0]:.0f} s as well: the delays may "
-                f"belong to the wrong one; anchors that are not in one plane, heights, or a known start resolve this"
+                f"belong to the wrong one"
             )
     return ""
 
@@ -264,6 +264,6 @@ def resolve_headings(scene: Scene, state: State) -> tuple[Scene, State, str]:
             break
     text = (
         f"a second solution, with another heading of {', '.join(unsure)}, fits as well: the delays may belong to the "
-        f"wrong one; attitudes or a known start resolve this"
+        f"wrong one"
     )
     return scene.turned_by(heading), best.state, text if unsure else ""

@@ -57,7 +57,7 @@ def test_without_noise_delays_and_places_are_exact():
         found = np.array([board.position_m[0] for board in one.boards])
         place = world.places[k][:, 0] - world.places[k][0, 0]
         assert found == pytest.approx(place * np.sign(place[1]), abs=1e-4)
-    assert (result.warnings, result.second_best) == ((), None)
+    assert (result.findings, result.second_best) == ((), None)
 
 
 def assert_sound(world, result):
@@ -284,7 +284,8 @@ def test_what_is_said_wrongly_is_named(mistake):
     world, known, kind, message = mistake()
     result = calib.survey(world.ranges, known=known, regardless=True)
     assert [one.fault for one in result.contradictions] == [kind]
-    assert re.search(message, result.findings[0])
+    assert re.search(message, result.contradictions[0].evidence)
+    assert 0 <= (result.contradictions[0].p_value or 0) < 0.01
     assert max(map(abs, scores(result, world.delays_ns).values())) < 4
     if kind == "arrangement not as it is said to be":
         assert [one.known for one in result.arrangements] == ["line", "line", "plane", "line", "line"]
