@@ -29,7 +29,7 @@ from uwblink.twr import STAMPS, Exchanges, board_range, raw_range
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.air import WEAK, Outcomes, Schedule
-from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, Link
+from uwbsim.world.channel import CHANNEL_EFFECTS, Link
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import INDEX_STEPS, impulse_response
 from uwbsim.world.reception import Frames, Medium
@@ -240,7 +240,7 @@ def reported_faults(scenario: Scenario, plan: Schedule, outcomes: Outcomes) -> l
 def provenance(scenario: Scenario) -> dict[str, Any]:
     """Return a recording's `meta` of a simulated flight: the scenario whole, its seed, and what it planted."""
     # Channel effects of plug-ins are not part of the scenario, but the flight cannot be repeated without them.
-    added = [name for name in CHANNEL_EFFECTS if name not in OWN_EFFECTS]
+    added = [effect.name for effect in CHANNEL_EFFECTS.added()]
     # Antenna delays programmed into tags: the default under None, others by the ids of their tags.
     by_tag = {tag.id: AntennaDelay(**tag.antenna_delay.model_dump()) for tag in scenario.tags}
     delays: AntennaDelays = {None: AntennaDelay(), **{k: one for k, one in by_tag.items() if one != AntennaDelay()}}

@@ -37,13 +37,13 @@ from threadpoolctl import threadpool_limits
 import uwblink
 from uwblink.errors import UwblinkError
 from uwblink.output import interrupts_held
-from uwblink.protocols.table import PROTOCOLS, RangingProtocol, register_protocol
+from uwblink.protocols.table import PROTOCOLS, RangingProtocol
 from uwbsim.errors import ParameterError, UwbsimError
 from uwbsim.protocols.comparison import compare
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import Simulated, simulate
 from uwbsim.sweep.design import EVALUATORS, Run, evaluators
-from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, ChannelEffect
+from uwbsim.world.channel import CHANNEL_EFFECTS, ChannelEffect
 
 Evaluate = Callable[[Simulated], Mapping[str, Any]]
 """Returns the results of a flight as columns of one row: numbers, texts or None."""
@@ -69,20 +69,19 @@ class Work:
     protocols: tuple[RangingProtocol, ...]
     ranges: int
     evaluate: Evaluate | None = None
-    effects: tuple[tuple[str, ChannelEffect], ...] = ()
+    effects: tuple[ChannelEffect, ...] = ()
 
     @classmethod
     def of_here(cls, name: str, protocols: Iterable[str], ranges: int, evaluate: Evaluate | None = None) -> Work:
         """Return the work of a sweep with the protocols and channel effects that are registered in this process."""
-        effects = tuple((name, effect) for name, effect in CHANNEL_EFFECTS.items() if name not in OWN_EFFECTS)
-        rows = tuple(PROTOCOLS[name] for name in protocols)
+        rows, effects = tuple(PROTOCOLS[name] for name in protocols), tuple(CHANNEL_EFFECTS.added())
         return cls(name=name, protocols=rows, ranges=ranges, evaluate=evaluate, effects=effects)
 
     def check(self) -> None:
         """Raise `ParameterError` for a function that another process cannot import by its name."""
         parts = ("flight_ticks", "delay_weights")
         named: dict[str, object] = {
-            **{f"channel effect {name!r}": effect for name, effect in self.effects},
+            **{f"channel effect {effect.name!r}": effect.apply for effect in self.effects},
             **{f"{part} of protocol {row.name!r}": getattr(row, part) for row in self.protocols for part in parts},
             **({} if self.evaluate is None else {"evaluate": self.evaluate}),
         }
@@ -135,12 +134,8 @@ class Work:
 def run_chunk(runs: Sequence[Run], work: Work) -> tuple[list[Result], float]:
     """Do some runs; return their results, and the seconds that they took together."""
     start = time.perf_counter()
-    # Registrations of this process are kept.
-    for row in work.protocols:
-        if row.name not in PROTOCOLS:
-            register_protocol(row)
-    for name, effect in work.effects:
-        CHANNEL_EFFECTS.setdefault(name, effect)
+    PROTOCOLS.adopt(work.protocols)
+    CHANNEL_EFFECTS.adopt(work.effects)
     # One thread of linear algebra for each worker, so that results do not depend on the number of cores.
     with threadpool_limits(limits=1, user_api="blas"):
         return [work.do(run) for run in runs], time.perf_counter() - start

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from uwblink.arrays import ArrayRows, Floats, Ints
+from uwblink.errors import ArgumentError, restating
+from uwblink.plugins import Registry, check_row
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.scenario.bodies import Room, Shadow
@@ -147,8 +150,16 @@ def paths_heard(link: Link, ends: Ends, detour_m: Floats) -> list[PathsHeard]:
     ]
 
 
-ChannelEffect = Callable[[Link, Ends], Link]
+Effect = Callable[[Link, Ends], Link]
 """Returns n links between given ends after an effect; `dataclasses.replace` keeps what it does not change."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelEffect:
+    """An effect by its name; an entry point of the group `uwbcal.effects` names one, or a list of them."""
+
+    name: str
+    apply: Effect
 
 
 def link_between(ends: Ends) -> Link:
@@ -158,10 +169,12 @@ def link_between(ends: Ends) -> Link:
         gain = ends.gain_towards_db(ends.towards, -ends.towards)
         power = path_gain_db(ends.scenario.radio, ends.distance_m) + gain
     link = Link(ends.distance_m, nothing, power, power, ends.distance_m[:, None], power[:, None])
-    for name, effect in CHANNEL_EFFECTS.items():
-        link = effect(link, ends)
-        if name not in OWN_EFFECTS:
-            _check(name, link, ends)
+    for effect in OWN_EFFECTS:
+        link = effect.apply(link, ends)
+    for effect in CHANNEL_EFFECTS.added():
+        with CHANNEL_EFFECTS.calling(effect.name, ScenarioError):
+            link = effect.apply(link, ends)
+        _check(effect.name, link, ends)
     return link
 
 
@@ -293,23 +306,28 @@ def _group_delays(link: Link, ends: Ends) -> Link:
     return replace(link, excess_m=link.excess_m + late, paths_m=link.paths_m + late[:, None])
 
 
-CHANNEL_EFFECTS: Final[dict[str, ChannelEffect]] = {
-    "obstacles": _obstacles,
-    "shadows": _shadows,
-    "reflections": _reflections,
-    "lasting reflections": _states,
-    "response": _response,
-    "fading and outages": _levels,
-    "group delays": _group_delays,
-}
-"""Effects on every link of every scenario, in this order; effects of plug-ins are last."""
+OWN_EFFECTS: Final = (
+    ChannelEffect("obstacles", _obstacles),
+    ChannelEffect("shadows", _shadows),
+    ChannelEffect("reflections", _reflections),
+    ChannelEffect("lasting reflections", _states),
+    ChannelEffect("response", _response),
+    ChannelEffect("fading and outages", _levels),
+    ChannelEffect("group delays", _group_delays),
+)
+"""The project's own effects, in this order, which depend only on the scenario."""
 
-OWN_EFFECTS: Final = tuple(CHANNEL_EFFECTS)
-"""Effects that depend only on the scenario."""
+CHANNEL_EFFECTS: Final[Registry[ChannelEffect]] = Registry(
+    "channel effect",
+    "uwbcal.effects",
+    OWN_EFFECTS,
+    partial(check_row, "channel effect", ChannelEffect, {"apply": (callable, "a function of link and ends")}),
+)
+"""Effects on every link of every scenario: the project's, then those of programs and of installed distributions."""
 
 
-def register_channel_effect(name: str, effect: ChannelEffect) -> None:
-    """Add an effect to every link that is simulated from now on; `del CHANNEL_EFFECTS[name]` removes it.
+def register_channel_effect(name: str, effect: Effect) -> None:
+    """Add an effect to every link that is simulated from now on; `CHANNEL_EFFECTS.remove` removes it.
 
     `effect(link, ends)` gets n links (`Link`: distances and excess lengths in metres, powers in dBm, (n,) each) and
     their two ends (`Ends`), and returns links. It must not depend on anything else, so that the same seed gives the
@@ -323,14 +341,7 @@ def register_channel_effect(name: str, effect: ChannelEffect) -> None:
     >>> uwbsim.register_channel_effect("rain", rain)
     >>> [*CHANNEL_EFFECTS][-3:]
     ['fading and outages', 'group delays', 'rain']
-    >>> del CHANNEL_EFFECTS["rain"]
+    >>> CHANNEL_EFFECTS.remove("rain")
     """
-    if not isinstance(name, str) or not name:
-        raise ParameterError(f"found {name!r:.40}, expected a word", parameter="name")
-    if name in CHANNEL_EFFECTS:
-        raise ParameterError(
-            f"found {name!r}, which is taken; the effects are {', '.join(CHANNEL_EFFECTS)}", parameter="name"
-        )
-    if not callable(effect):
-        raise ParameterError(f"found {effect!r}, expected a function of link and ends", parameter="effect")
-    CHANNEL_EFFECTS[name] = effect
+    with restating(ParameterError, ArgumentError):
+        CHANNEL_EFFECTS.register(ChannelEffect(name, effect))
