@@ -26,7 +26,6 @@ from uwblink.cli.shared import (
     Seed,
     Seeds,
     add,
-    choice,
     interrupts,
     new_app,
     print_json,
@@ -36,6 +35,7 @@ from uwblink.cli.shared import (
     waiting,
 )
 from uwblink.output import check_folder, check_output
+from uwbsim.settings import protocol_names
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -60,14 +60,8 @@ AllowFiles = Annotated[
 ]
 
 
-def _protocols() -> list[str]:
-    from uwblink import PROTOCOLS
-
-    return list(PROTOCOLS)
-
-
 Protocols = Annotated[
-    str, typer.Option(help="Protocols, separated by commas, or all.", **several(lambda: ["all", *_protocols()]))
+    str, typer.Option(help="Protocols, separated by commas, or all.", **several(lambda: ["all", *protocol_names()]))
 ]
 
 
@@ -257,51 +251,7 @@ def _print_table(rows: Sequence[Sequence[str]], title: str | None = None) -> Non
 
 
 def predict(
-    protocol: Annotated[
-        str,
-        typer.Option(help="Protocol by its name.", **choice("ss", "ss-cfo", "ds", "ds-alt", "ds-sym", more=_protocols)),
-    ] = "ds",
-    skew_ppm: Annotated[
-        float, typer.Option(rich_help_panel="Tags", help="Skew of the initiator's clock relative to the target's.")
-    ] = 0.0,
-    reply_delay_us: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel="Timing", help="Delay of the target's reply (dt32).")
-    ] = 300.0,
-    final_delay_us: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            rich_help_panel="Timing",
-            help="Delay of the third message (dt53; only ds, ds-alt); by default 1538.7.",
-        ),
-    ] = None,
-    distance_m: Annotated[float, typer.Option(min=0.0, rich_help_panel="Tags", help="Distance.")] = 5.0,
-    speed_mps: Annotated[float, typer.Option(rich_help_panel="Tags", help="Speed at which the distance grows.")] = 0.0,
-    drift_ppm_per_s: Annotated[float, typer.Option(rich_help_panel="Tags", help="Change of the relative skew.")] = 0.0,
-    tx_noise_ps: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel="Noise", help="Standard deviation of transmit stamps.")
-    ] = 0.0,
-    rx_noise_ps: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel="Noise", help="Standard deviation of receive stamps.")
-    ] = 150.0,
-    carrier_noise_ppm: Annotated[
-        float,
-        typer.Option(min=0.0, rich_help_panel="Noise", help="Standard deviation of the carrier integrator's reading."),
-    ] = 0.2,
-    carrier_bias_ppm: Annotated[
-        float, typer.Option(rich_help_panel="Noise", help="Bias of the carrier integrator's reading.")
-    ] = 0.0,
-    delay_initiator_ns: Annotated[
-        float,
-        typer.Option(rich_help_panel="Tags", help="Antenna delay of the initiator; a positive one shortens ranges."),
-    ] = 0.0,
-    delay_target_ns: Annotated[
-        float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the target; a positive one shortens ranges.")
-    ] = 0.0,
-    whole_ticks: Annotated[
-        bool,
-        typer.Option("--whole-ticks", rich_help_panel="Noise", help="Round stamps to ticks of 15.65 ps."),
-    ] = False,
+    state: uwbsim.State,
     tags: Annotated[
         int | None,
         typer.Option(help="Also predict the rates and errors of a fleet of this many tags, for each way of ranging."),
@@ -309,22 +259,6 @@ def predict(
     as_json: AsJson = False,
 ) -> None:
     """Predict the bias and standard deviation of a range analytically."""
-    state = uwbsim.State(
-        protocol=protocol,
-        skew_ppm=skew_ppm,
-        reply_delay_us=reply_delay_us,
-        final_delay_us=final_delay_us,
-        distance_m=distance_m,
-        speed_mps=speed_mps,
-        drift_ppm_per_s=drift_ppm_per_s,
-        tx_noise_ps=tx_noise_ps,
-        rx_noise_ps=rx_noise_ps,
-        carrier_noise_ppm=carrier_noise_ppm,
-        carrier_bias_ppm=carrier_bias_ppm,
-        delay_initiator_ns=delay_initiator_ns,
-        delay_target_ns=delay_target_ns,
-        whole_ticks=whole_ticks,
-    )
     found, fleet = uwbsim.predict_state(state), [] if tags is None else uwbsim.predict_fleet(state, tags)
     more = {"fleet": [one.to_dict() for one in fleet]} if fleet else {}
     print_result(found.to_dict() | more, str(found), as_json=as_json)
