@@ -238,9 +238,10 @@ class BoardRadio:
         """Whether a frame is being sent or scheduled."""
         return self._pending is not None and self._pending.end > self._air.env.now and not self._pending.cancelled
 
-    def listen(self) -> None:
-        """Switch the receiver on, at once or at the end of the frame that is being sent."""
+    def listen(self) -> int:
+        """Switch the receiver on, at once or at the end of the frame that is being sent; return that time (ns)."""
         self.since = self._pending.end if self._pending is not None and self.sending else int(self._air.env.now)
+        return self.since
 
     def off(self) -> None:
         """Switch receiver and transmitter off; a scheduled frame is never sent."""
@@ -261,9 +262,7 @@ class BoardRadio:
         Without a timeout the wait has no end.
         """
         env = self._air.env
-        if self.since is None:
-            self.listen()
-        since = int(env.now) if self.since is None else self.since
+        since = self.listen() if self.since is None else self.since
         arrived = self._waiting = env.event()
         if timeout is None:
             yield arrived

@@ -12,7 +12,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.arrays import Floats, Ints, in_time_order
+from uwblink.arrays import ArrayRows, Floats, Ints, in_time_order
 from uwblink.protocols.table import RangingProtocol
 from uwblink.receptions import Receptions, exchanges_in
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, meta_of_delays
@@ -41,11 +41,11 @@ MASK: Final = (1 << REPORT_BITS) - 1
 Ticks = TypeVar("Ticks", Ints, int)
 
 
-@dataclass(slots=True)
-class Draws:
+@dataclass(frozen=True, slots=True)
+class Draws(ArrayRows):
     """Random numbers of planned slots, one row per slot, so that a lost exchange shifts no others.
 
-    `transmit` and `receive` are standard normal, shape (messages, n); `reply_s` is the latency of a
+    `transmit` and `receive` are standard normal, shape (n, messages); `reply_s` is the latency of a
     reply sent at once; `excess_m` the detour by multipath.
     """
 
@@ -53,10 +53,6 @@ class Draws:
     receive: Floats
     reply_s: Floats
     excess_m: Floats
-
-    def __getitem__(self, rows: Ints) -> Draws:
-        """Return the draws of the chosen slots."""
-        return Draws(self.transmit[:, rows], self.receive[:, rows], self.reply_s[rows], self.excess_m[rows])
 
 
 @dataclass(slots=True)
@@ -81,8 +77,8 @@ def draw(scenario: Scenario, count: int, messages: int) -> Draws:
         hit = rng.random(count) < share
         excess = np.where(hit, rng.exponential(mean_m, count), 0.0)
     return Draws(
-        transmit=np.array([stream(seed, "transmit noise", k).normal(size=count) for k in numbers]),
-        receive=np.array([stream(seed, "receive noise", k).normal(size=count) for k in numbers]),
+        transmit=np.column_stack([stream(seed, "transmit noise", k).normal(size=count) for k in numbers]),
+        receive=np.column_stack([stream(seed, "receive noise", k).normal(size=count) for k in numbers]),
         reply_s=draw_reply_s(scenario, stream(seed, "reply latency"), count),
         excess_m=excess,
     )
@@ -90,7 +86,7 @@ def draw(scenario: Scenario, count: int, messages: int) -> Draws:
 
 def one_departure(draws: Draws, listeners: int) -> Draws:
     """Return draws with the same noise of departure in all rows of a frame."""
-    return replace(draws, transmit=np.repeat(draws.transmit[:, ::listeners], listeners, axis=1))
+    return replace(draws, transmit=np.repeat(draws.transmit[::listeners], listeners, axis=0))
 
 
 def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Floats:
@@ -124,9 +120,9 @@ def stamp(medium: Medium, protocol: RangingProtocol, begun: Schedule, draws: Dra
             counter = scheduled_counter(result.stamps[message.after], medium.scenario.ranging.response_delay_uus)
         else:
             counter = reply_counter(result.stamps[message.after], draws.reply_s)
-        left = medium.leave(sender, counter + medium.tx_register[sender], draws.transmit[k])
+        left = medium.leave(sender, counter + medium.tx_register[sender], draws.transmit[:, k])
         frames = Frames(sender=sender, receiver=receiver, departure=left)
-        received, link = medium.receive(frames, draws.receive[k], draws.excess_m)
+        received, link = medium.receive(frames, draws.receive[:, k], draws.excess_m)
         added = medium.reply_constant if message.timing == "scheduled" else medium.tx_register
         result.stamps[f"tx{k + 1}"] = counter + added[sender]
         result.stamps[f"rx{k + 1}"] = received
