@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Final
 
 from uwblink.settings import setting
 from uwbsim.errors import ParameterError
+
+FROM_ZERO: Final = (0.0, math.inf)
 
 
 def protocol_names() -> Iterable[str]:
@@ -41,20 +43,26 @@ class State:
         more=protocol_names,
     )
     skew_ppm: float = setting(0.0, "Skew of the initiator's clock relative to the target's.", rich_help_panel="Tags")
-    reply_delay_us: float = setting(300.0, "Delay of the target's reply (dt32).", min=0.0, rich_help_panel="Timing")
+    reply_delay_us: float = setting(
+        300.0, "Delay of the target's reply (dt32).", bounds=FROM_ZERO, rich_help_panel="Timing"
+    )
     final_delay_us: float | None = setting(
         None,
         "Delay of the third message (dt53; only ds, ds-alt); by default 1538.7.",
-        min=1.0,  # a third message that follows at once would not tell the clocks' rates
+        bounds=(1.0, math.inf),  # a third message that follows at once would not tell the clocks' rates
         rich_help_panel="Timing",
     )
-    distance_m: float = setting(5.0, "Distance.", min=0.0, rich_help_panel="Tags")
+    distance_m: float = setting(5.0, "Distance.", bounds=FROM_ZERO, rich_help_panel="Tags")
     speed_mps: float = setting(0.0, "Speed at which the distance grows.", rich_help_panel="Tags")
     drift_ppm_per_s: float = setting(0.0, "Change of the relative skew.", rich_help_panel="Tags")
-    tx_noise_ps: float = setting(0.0, "Standard deviation of transmit stamps.", min=0.0, rich_help_panel="Noise")
-    rx_noise_ps: float = setting(150.0, "Standard deviation of receive stamps.", min=0.0, rich_help_panel="Noise")
+    tx_noise_ps: float = setting(
+        0.0, "Standard deviation of transmit stamps.", bounds=FROM_ZERO, rich_help_panel="Noise"
+    )
+    rx_noise_ps: float = setting(
+        150.0, "Standard deviation of receive stamps.", bounds=FROM_ZERO, rich_help_panel="Noise"
+    )
     carrier_noise_ppm: float = setting(
-        0.2, "Standard deviation of the carrier integrator's reading.", min=0.0, rich_help_panel="Noise"
+        0.2, "Standard deviation of the carrier integrator's reading.", bounds=FROM_ZERO, rich_help_panel="Noise"
     )
     carrier_bias_ppm: float = setting(0.0, "Bias of the carrier integrator's reading.", rich_help_panel="Noise")
     delay_initiator_ns: float = setting(
@@ -68,7 +76,8 @@ class State:
     def __post_init__(self) -> None:
         """Check the numbers; the protocol is checked where it is used."""
         for one in fields(self):
-            name, value, least = one.name, getattr(self, one.name), one.metadata["shown"].get("min", -math.inf)
+            name, value = one.name, getattr(self, one.name)
+            least, _ = one.metadata["bounds"] or (-math.inf, math.inf)
             if name in ("protocol", "whole_ticks") or value is None:
                 continue
             if not isinstance(value, int | float) or not abs(value) < 1e9:
