@@ -7,7 +7,7 @@ of `CHANNEL_EFFECTS` applies to all of them equally.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -27,6 +27,7 @@ from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.radio import antenna_gain_db, group_delay_m, path_gain_db
 
 if TYPE_CHECKING:
+    from uwbsim.world.geometric import GeometricResponses
     from uwbsim.world.world import World
 
 
@@ -164,11 +165,8 @@ class ChannelEffect:
 
 def link_between(ends: Ends) -> Link:
     """Return the links between known ends, (n,), after all effects of `CHANNEL_EFFECTS` in their order."""
-    power = nothing = np.zeros_like(ends.distance_m)
-    if ends.world.responses is None:  # geometric responses also have the powers
-        gain = ends.gain_towards_db(ends.towards, -ends.towards)
-        power = path_gain_db(ends.scenario.radio, ends.distance_m) + gain
-    link = Link(ends.distance_m, nothing, power, power, ends.distance_m[:, None], power[:, None])
+    responses = ends.world.responses
+    link = _direct(ends) if responses is None else _of_responses(ends, responses)
     for effect in OWN_EFFECTS:
         link = effect.apply(link, ends)
     for effect in CHANNEL_EFFECTS.added():
@@ -176,6 +174,26 @@ def link_between(ends: Ends) -> Link:
             link = effect.apply(link, ends)
         _check(effect.name, link, ends)
     return link
+
+
+def _direct(ends: Ends) -> Link:
+    """Return links with direct paths alone, weaker and longer by what they cross: obstacles, bodies with a shadow."""
+    scenario, distance, towards = ends.scenario, ends.distance_m, ends.towards
+    power = path_gain_db(scenario.radio, distance) + ends.gain_towards_db(towards, -towards)
+    link = Link(distance, np.zeros_like(distance), power, power, distance[:, None], power[:, None])
+    if scenario.obstacles:
+        loss, excess = box_loss(scenario.obstacles, *ends.antennas_m)
+        link = replace(link.weaker(loss), excess_m=excess, paths_m=(distance + excess)[:, None])
+    for body in ends.shadows:
+        link = link.weaker(body.loss_db(*(spots[:, None] for spots in ends.antennas_m))[:, 0])
+    return link
+
+
+def _of_responses(ends: Ends, responses: GeometricResponses) -> Link:
+    """Return links with excess length, powers and noise of geometric responses, which have their own paths."""
+    distance, read = ends.distance_m, responses.at(ends.places, ends.time_s)
+    nothing = np.zeros((len(distance), 1))
+    return Link(distance, read.excess_m, read.power_dbm, read.total_dbm, distance[:, None], nothing, read.noise_s)
 
 
 def _check(name: str, link: Link, ends: Ends) -> None:
@@ -189,20 +207,6 @@ def _check(name: str, link: Link, ends: Ends) -> None:
                 f"channel effect {name!r}: {column}: returned {values!r:.60}, expected {len(ends.distance_m)} finite "
                 "numbers"
             )
-
-
-def _obstacles(link: Link, ends: Ends) -> Link:
-    if not ends.scenario.obstacles or ends.world.responses is not None:
-        return link
-    loss, excess = box_loss(ends.scenario.obstacles, *ends.antennas_m)
-    return replace(link.weaker(loss), excess_m=excess, paths_m=(link.distance_m + excess)[:, None])
-
-
-def _shadows(link: Link, ends: Ends) -> Link:
-    """Apply the loss of bodies on the direct path, before the first path is chosen."""
-    for body in ends.shadows if ends.world.responses is None else ():
-        link = link.weaker(body.loss_db(*(spots[:, None] for spots in ends.antennas_m))[:, 0])
-    return link
 
 
 def _reflections(link: Link, ends: Ends) -> Link:
@@ -281,14 +285,6 @@ def _states(link: Link, ends: Ends) -> Link:
     )
 
 
-def _response(link: Link, ends: Ends) -> Link:
-    """Use excess length, powers and noise of geometric responses; the effects above skip links with one."""
-    if ends.world.responses is None:
-        return link
-    read = ends.world.responses.at(ends.places, ends.time_s)
-    return replace(link, **{column.name: getattr(read, column.name) for column in fields(read)})
-
-
 def _levels(link: Link, ends: Ends) -> Link:
     """Apply fading and outages of pairs to all paths."""
     if not ends.world.levels:
@@ -307,11 +303,8 @@ def _group_delays(link: Link, ends: Ends) -> Link:
 
 
 OWN_EFFECTS: Final = (
-    ChannelEffect("obstacles", _obstacles),
-    ChannelEffect("shadows", _shadows),
     ChannelEffect("reflections", _reflections),
     ChannelEffect("lasting reflections", _states),
-    ChannelEffect("response", _response),
     ChannelEffect("fading and outages", _levels),
     ChannelEffect("group delays", _group_delays),
 )

@@ -325,7 +325,7 @@ def test_a_body_in_the_way_weakens_served_boards_by_its_chord():
 @pytest.mark.parametrize(
     ("name", "effect", "fragment"),
     [
-        ("shadows", lambda link, _: link, "channel effect 'shadows': this name is reserved"),
+        ("reflections", lambda link, _: link, "channel effect 'reflections': this name is reserved"),
         ("x", 3, "channel effect 'x': apply: found 3, expected a function"),
         ("", lambda link, _: link, "channel effect '': name: found '', expected a word"),
     ],
