@@ -246,17 +246,18 @@ def slope_of(tag: ScenarioTag, devices: Devices, name: str) -> float:
     return float(getattr(devices, name) if value is None else value)
 
 
-def range_shift_m(scenario: Scenario, tag: ScenarioTag, time_s: Floats) -> Floats | None:
-    """Return the change of ranges by a tag's temperature and voltage at times (n,); None for a tag without
-    an effect.
-    """
+RangeEffect = tuple[Profile, float, float]
+"""A quantity over time on which ranges depend, their slope in metres per unit, and its reference."""
+
+
+def range_effects(scenario: Scenario, tag: ScenarioTag) -> list[RangeEffect]:
+    """Return the effects of a tag's temperature and voltage on ranges; none without a profile or a slope."""
     d = scenario.devices
     effects = (
         (profile_of(scenario, tag, "temperature_c"), slope_of(tag, d, "range_mm_per_k") * 1e-3, d.reference_c),
         (profile_of(scenario, tag, "supply_v"), slope_of(tag, d, "range_cm_per_v") * 1e-2, d.reference_v),
     )
-    parts = [slope * (profile_at(profile, time_s) - ref) for profile, slope, ref in effects if profile and slope]
-    return np.sum(parts, axis=0) if parts else None
+    return [(profile, slope, reference) for profile, slope, reference in effects if profile and slope]
 
 
 def thermal_rate(scenario: Scenario, tag: ScenarioTag, time_s: Floats) -> Floats:
