@@ -9,6 +9,7 @@ import warnings
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import EntryPoint
+from typing import Any
 
 import pytest
 
@@ -69,7 +70,7 @@ def test_protocol_and_loss_of_another_distribution_are_simulated_and_fitted_with
 
 def test_an_effect_of_another_distribution_applies_to_the_flights_of_the_command_and_is_recorded(run, tmp_path):
     settings = ("--set", "run.duration_s=1", "--set", "radio.quantize=false")
-    powers, recorded = [], []
+    powers, recorded = list[Any](), list[Any]()
     for command in (run, processes.run):
         flight = tmp_path / f"{len(powers)}.uwb"
         assert command("uwbsim", "run", "scenarios/noiseless.toml", "-o", flight, *settings).returncode == 0

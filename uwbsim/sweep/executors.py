@@ -14,7 +14,7 @@ import platform
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     CancelledError,
@@ -25,7 +25,8 @@ from concurrent.futures import (
 )
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from multiprocessing.connection import Connection
 from threading import Thread
@@ -35,7 +36,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import uwblink
-from uwblink.errors import UwblinkError
+from uwblink.errors import UwblinkError, raising
 from uwblink.output import interrupts_held
 from uwblink.protocols.table import PROTOCOLS, RangingProtocol
 from uwbsim.errors import ParameterError, UwbsimError
@@ -60,8 +61,9 @@ Done = tuple[Chunk, list[Result] | None, float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Work:
-    """What all runs of a sweep have in common: name of the scenario, protocols, evaluation, and plug-ins.
+    """What all runs of a sweep have in common: name of the scenario, protocols, evaluation, and channel effects.
 
+    The effects are those that programs and other distributions have added in the process that makes it.
     With `evaluate` each protocol's flight is simulated and evaluated; without, protocols are compared by `ranges`.
     """
 
@@ -69,13 +71,7 @@ class Work:
     protocols: tuple[RangingProtocol, ...]
     ranges: int
     evaluate: Evaluate | None = None
-    effects: tuple[ChannelEffect, ...] = ()
-
-    @classmethod
-    def of_here(cls, name: str, protocols: Iterable[str], ranges: int, evaluate: Evaluate | None = None) -> Work:
-        """Return the work of a sweep with the protocols and channel effects that are registered in this process."""
-        rows, effects = tuple(PROTOCOLS[name] for name in protocols), tuple(CHANNEL_EFFECTS.added())
-        return cls(name=name, protocols=rows, ranges=ranges, evaluate=evaluate, effects=effects)
+    effects: tuple[ChannelEffect, ...] = field(default_factory=lambda: tuple(CHANNEL_EFFECTS.added()))
 
     def check(self) -> None:
         """Raise `ParameterError` for a function that another process cannot import by its name."""
@@ -150,12 +146,9 @@ def evaluator(kind: str) -> Evaluate:
             f"one (entry point {kind!r} of the group {EVALUATORS})",
             parameter="evaluate",
         )
-    try:
+    what = f"{entry.value}, which {EVALUATORS} names, cannot be imported"
+    with raising(partial(ParameterError, parameter="evaluate"), what, ImportError, AttributeError):
         found: Evaluate = entry.load()
-    except (ImportError, AttributeError) as error:
-        raise ParameterError(
-            f"{entry.value}, which {EVALUATORS} names, cannot be imported: {error}", parameter="evaluate"
-        ) from error
     return found
 
 
@@ -277,20 +270,15 @@ class Cluster(Workers):
         """Connect; raises `ParameterError` where no scheduler answers in time."""
         work.check()
         self._address = address
-        try:
+        refused = partial(ParameterError, parameter="scheduler")
+        with raising(refused, "needs the extra 'cluster'", ImportError, remedy=": pip install 'uwbcal[cluster]'"):
             dask: Any = import_module("distributed")
-        except ImportError as error:
-            raise ParameterError(
-                "needs the extra 'cluster': pip install 'uwbcal[cluster]'", parameter="scheduler"
-            ) from error
         self.died = dask.KilledWorker
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
-        try:
+        with raising(
+            refused, f"{address} does not answer within {self.connect_s} s", OSError, TimeoutError, ValueError
+        ):
             self._client = dask.Client(address, timeout=self.connect_s, set_as_default=False)
-        except (OSError, TimeoutError, ValueError) as error:
-            raise ParameterError(
-                f"{address} does not answer within {self.connect_s} s", parameter="scheduler"
-            ) from error
         super().__init__(max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1), work)
 
     def _start_pool(self) -> Any:
