@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -83,7 +84,7 @@ def run(
 ) -> None:
     """Simulate a scenario and write the recording of its boards and motion capture."""
     check_output(output, force=force, recording=True)
-    loaded = _programmed(uwbsim.load(scenario, overrides or (), seed, allow_files=allow_files or ()), antenna_delays)
+    loaded = _loaded(scenario, overrides, allow_files, antenna_delays, seed)
     with waiting(loaded.run.name) as report:
         simulated = uwbsim.simulate(loaded, report, contention=contention)
     frames: list[Any] = []
@@ -97,11 +98,18 @@ def run(
     )
 
 
-def _programmed(scenario: uwbsim.Scenario, path: Path | None) -> uwbsim.Scenario:
-    """Return a scenario with the antenna delays of a file programmed into its tags."""
-    if path is None:
-        return scenario
-    return scenario.model_copy(update={"tags": uwbsim.scenario.with_antenna_delays(scenario.tags, path)})
+def _loaded(
+    scenario: Path,
+    overrides: list[str] | None,
+    allow_files: list[Path] | None,
+    antenna_delays: Path | None = None,
+    seed: int | None = None,
+) -> uwbsim.Scenario:
+    """Return a scenario with the antenna delays of a file, if there is one, programmed into its tags."""
+    loaded = uwbsim.load(scenario, overrides or (), seed, allow_files=allow_files or ())
+    if antenna_delays is None:
+        return loaded
+    return loaded.model_copy(update={"tags": uwbsim.scenario.with_antenna_delays(loaded.tags, antenna_delays)})
 
 
 def scenarios(
@@ -142,12 +150,10 @@ def serve(
     """Run the boards of a scenario on pseudo-terminals, where they answer like real boards on serial ports."""
     if poses:
         check_output(poses, force=force)
-    loaded = _programmed(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()), antenna_delays)
+    loaded = _loaded(scenario, overrides, allow_files, antenna_delays)
     wrong = uwbsim.load_faults(faults, [tag.id for tag in loaded.tags]) if faults else None
-    server = uwbsim.Server(
-        uwbsim.Server.extended(loaded, duration), link_dir, wrong, tell=lambda text: typer.echo(text, err=True)
-    )
-    try:
+    served = uwbsim.Server.extended(loaded, duration)
+    with closing(uwbsim.Server(served, link_dir, wrong, tell=lambda text: typer.echo(text, err=True))) as server:
         for tag, name in server.names.items():
             typer.echo(f"tag {tag:3d}  {name}")
         ports = f"{link_dir}/*" if link_dir else " ".join(server.names.values())
@@ -158,8 +164,6 @@ def serve(
             server.write_poses(poses)
         with interrupts() as stop:
             server.run(stop, duration or float("inf"))
-    finally:
-        server.close()
 
 
 def show(
@@ -172,7 +176,7 @@ def show(
     """Draw the room, the flights, and one exchange of each protocol."""
     check_output(output, force=force)
     with waiting("drawing"):
-        uwbsim.show(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()), output, force=force)
+        uwbsim.show(_loaded(scenario, overrides, allow_files), output, force=force)
     typer.echo(f"{output}")
 
 
@@ -183,7 +187,7 @@ def validate(
     as_json: AsJson = False,
 ) -> None:
     """Summarise what a scenario will do, without running it."""
-    found = uwbsim.preview(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()))
+    found = uwbsim.preview(_loaded(scenario, overrides, allow_files))
     print_result(found.to_dict(), str(found), as_json=as_json)
 
 
@@ -205,7 +209,7 @@ def compare(
 ) -> None:
     """Simulate ranges of every protocol in the same random world, and compare their errors and costs."""
     rows = _rows(protocols)
-    loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
+    loaded = _loaded(scenario, overrides, allow_files)
     check_folder(output, uwbsim.pages.FILES, force=force)
     _check_figures(figures, force=force)
     with waiting(loaded.run.name) as report:
@@ -278,7 +282,7 @@ def optimum(
 ) -> None:
     """Find the delay of the scheduled message that minimises the error of a pair's ranges averaged over one second."""
     rows = _rows(protocols)
-    loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
+    loaded = _loaded(scenario, overrides, allow_files)
     if output:
         check_folder(output, [uwbsim.pages.optimum_file(row.name) for row in rows], force=force)
     with waiting("searching"):
