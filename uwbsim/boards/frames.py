@@ -27,7 +27,7 @@ from uwbsim.scenario.ranging import (
     after_marker_s,
     before_marker_s,
 )
-from uwbsim.simulation.timestamps import draw_reply_s, next_grid, reply_counter, scheduled_counter
+from uwbsim.simulation.timestamps import next_grid, reply_counter, scheduled_counter
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.reception import Frames, Medium
@@ -129,7 +129,7 @@ class BoardAir:
 
     def reply_stamp(self, board: int, received: int) -> int:
         """Return the transmit stamp of an immediate reply to a frame received at a stamp, with a random latency."""
-        counter = reply_counter(received, draw_reply_s(self.scenario, self._rng, 1))
+        counter = reply_counter(received, self.scenario.ranging.reply.draw_s(self._rng, 1))
         return int(counter[0]) + self._tx_register(board)
 
     def scheduled_stamps(self, board: int, reference: int, delay_uus: int) -> tuple[int, int]:

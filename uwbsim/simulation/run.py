@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Floats
 from uwblink.protocols.table import ON_BOARDS, PROTOCOLS, RangingProtocol
 from uwblink.recording.contents import Contents
 from uwblink.recording.schema import FrameRow, Tag
@@ -28,10 +28,8 @@ from uwbsim.scenario.ranging import before_marker_s
 from uwbsim.simulation.air import WEAK, Air, Outcomes, Schedule, Slots, schedule, with_collisions_of_broadcasts
 from uwbsim.simulation.timestamps import (
     Draws,
-    Stamped,
     draw,
     one_departure,
-    overhear,
     provenance,
     reported_broadcasts,
     reported_exchanges,
@@ -160,8 +158,7 @@ def simulate(
     kept = kept[np.argsort(begun[kept], kind="stable")]
     rows = replace(plan[kept], start=begun[kept])
     stamped = stamp(medium, protocol, rows, draws[kept])
-    reported = reported_broadcasts if broadcast else _reported
-    found = reported(medium, kept, len(plan.start), rows, stamped)
+    found = (reported_broadcasts if broadcast else reported_exchanges)(medium, stamped)
     return Simulated(
         **found,
         poses=world.motion_capture(),
@@ -173,13 +170,6 @@ def simulate(
         imu=sensor_readings(scenario, world.trajectories, "imu"),
         height=sensor_readings(scenario, world.trajectories, "height"),
     )
-
-
-def _reported(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped: Stamped) -> dict[str, Any]:
-    """Return what boards report of the `kept` exchanges (n,), of all `planned`, and their true distances."""
-    exchanges = reported_exchanges(medium, kept, planned, rows, stamped)
-    truth_m = (stamped.links[0].distance_m + stamped.links[1].distance_m) / 2
-    return {"exchanges": exchanges, "overheard": overhear(medium, stamped, exchanges), "truth_m": truth_m}
 
 
 def _slots(medium: Medium, world: World, protocol: RangingProtocol, plan: Schedule, draws: Draws) -> Slots:

@@ -16,7 +16,7 @@ from uwblink.ticks import SPEED_OF_LIGHT, TX_SHARE
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Radio
 from uwbsim.world.channel import Link
-from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks, RangeEffect, profile_at, range_effects
+from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks, RangeEffect, range_effects
 from uwbsim.world.radio import (
     printed_power_dbm,
     printed_skew_ppm,
@@ -60,7 +60,7 @@ class AntennaDelays:
         for place, effects in self.variable.items():
             rows = np.flatnonzero(tag == place)
             time_s = time[rows] / SUBTICKS_PER_SECOND
-            shift_m = np.sum([slope * (profile_at(profile, time_s) - ref) for profile, slope, ref in effects], axis=0)
+            shift_m = np.sum([slope * (profile.at(time_s) - ref) for profile, slope, ref in effects], axis=0)
             total[rows] = 2 * shift_m / SPEED_OF_LIGHT
         return total
 
