@@ -22,7 +22,6 @@ from uwbsim.scenario.ranging import (
     FINAL_BYTES,
     POLL_BYTES,
     PREAMBLE_SYMBOL_S,
-    PREAMBLE_TIMEOUT_S,
     RESPONSE_BYTES,
     after_marker_s,
     before_marker_s,
@@ -256,7 +255,7 @@ class BoardRadio:
         self.listen()
         return self._pending
 
-    def wait(self, timeout: int | None = round(PREAMBLE_TIMEOUT_S * NS_PER_S)) -> Wait:
+    def wait(self, timeout: int | None) -> Wait:
         """Wait for a frame and return it; None if it is damaged, or if no preamble is detected within the timeout.
 
         Without a timeout the wait has no end.

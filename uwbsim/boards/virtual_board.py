@@ -51,8 +51,8 @@ FULL: Final = b"USB Buffer full! Message rejected to prevent overflow."
 class UsbLink:
     """The USB interface of one board from power-up to power-off.
 
-    `packets` wait to be read, and `arrived` is triggered when one comes; `lost` counts transfers that were dropped
-    because the bus was busy. Where it is not `open`, the board is unplugged, and transfers under way are lost.
+    `packets` wait to be read, and `arrived` is triggered when one comes. Transfers are lost while the bus is busy.
+    Where it is not `open`, the board is unplugged, and transfers under way are lost.
     """
 
     def __init__(self, env: simpy.Environment, send: Callable[[bytes], None]) -> None:
@@ -62,7 +62,6 @@ class UsbLink:
         self._busy_until = 0
         self.open = True
         self.arrived = env.event()
-        self.lost = 0
 
     def write(self, data: bytes) -> None:
         """Receive one write of the host, in packets of 64 bytes."""
@@ -99,10 +98,7 @@ class UsbLink:
 
     def _transfer(self, data: bytes) -> None:
         now = int(self._env.now)
-        if not self.open:
-            return
-        if now < self._busy_until:
-            self.lost += 1
+        if not self.open or now < self._busy_until:
             return
         self._busy_until = now + -(-len(data) // PACKET_BYTES) * PACKET_GAP
         self._send(data)
