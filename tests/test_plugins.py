@@ -9,11 +9,13 @@ import warnings
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import EntryPoint
+from typing import Any
 
 import pytest
 
 from tests import pages, processes
 from tests.errors import one_line
+from uwblink import Recording
 from uwblink.errors import ArgumentError, PluginWarning
 from uwblink.plugins import Registry
 
@@ -64,6 +66,19 @@ def test_protocol_and_loss_of_another_distribution_are_simulated_and_fitted_with
     planted = {"1": -0.36, "2": -0.01, "3": 0.24, "4": -0.36}
     assert document["loss"] == "welsch"
     assert {tag: document["delays_ns"][tag] for tag in planted} == pytest.approx(planted, abs=5e-3)
+
+
+def test_an_effect_of_another_distribution_applies_to_the_flights_of_the_command_and_is_recorded(run, tmp_path):
+    settings = ("--set", "run.duration_s=1", "--set", "radio.quantize=false")
+    powers, recorded = list[Any](), list[Any]()
+    for command in (run, processes.run):
+        flight = tmp_path / f"{len(powers)}.uwb"
+        assert command("uwbsim", "run", "scenarios/noiseless.toml", "-o", flight, *settings).returncode == 0
+        with Recording.open(flight) as opened:
+            powers.append(opened.exchanges().fpp1_dbm)
+            recorded.append(opened.meta().get("channel_effects"))
+    assert recorded == [["rain"], None]
+    assert powers[0] == pytest.approx(powers[1] - 3.0)
 
 
 @pytest.mark.slow

@@ -249,11 +249,6 @@ class Server:
         longer = min(max(scenario.run.duration_s, duration_s or 7200.0), LONGEST_RUN_S)
         return scenario.model_copy(update={"run": scenario.run.model_copy(update={"duration_s": longer})})
 
-    @property
-    def lost_bytes(self) -> int:
-        """Bytes that no client has read."""
-        return sum(t.lost_bytes for t in self._terminals.values())
-
     def run(self, stop: Callable[[], bool], duration_s: float = float("inf")) -> None:
         """Serve until `stop` returns True or the duration is over."""
         end_ns = duration_s * NS_PER_S
