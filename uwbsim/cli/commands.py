@@ -35,7 +35,7 @@ from uwblink.cli.shared import (
     starting,
     waiting,
 )
-from uwblink.output import check_folder, check_output
+from uwblink.output import check_apart, check_folder, check_output
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -148,6 +148,7 @@ def serve(
     """Run the boards of a scenario on pseudo-terminals, where they answer like real boards on serial ports."""
     if poses:
         check_output(poses, force=force)
+        check_apart({"poses": poses}, filter(None, (scenario, faults, antenna_delays)))
     loaded = _programmed(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()), antenna_delays)
     wrong = uwbsim.load_faults(faults, [tag.id for tag in loaded.tags]) if faults else None
     server = uwbsim.Server(

@@ -85,7 +85,7 @@ def test_what_cannot_be_exported_leaves_nothing(whole, tmp_path):
 def test_a_folder_without_a_name_of_its_own_is_refused_with_an_example(whole, tmp_path, monkeypatch, out, force):
     (tmp_path / "inside").mkdir()
     monkeypatch.chdir(tmp_path / "inside")
-    with pytest.raises(RecordingExistsError, match="existing folder.*as in .*tables"):
+    with pytest.raises(RecordingExistsError, match=r"existing folder.*as in .*tables"):
         export_recording(whole, out, to="csv", force=force)
     assert [*tmp_path.rglob("*")] == [tmp_path / "inside"]
 
