@@ -35,7 +35,7 @@ from uwblink.cli.shared import (
     starting,
     waiting,
 )
-from uwblink.output import check_folder, check_output
+from uwblink.output import check_apart, check_folder, check_output
 from uwbsim.settings import protocol_names
 
 if TYPE_CHECKING:
@@ -150,6 +150,7 @@ def serve(
     """Run the boards of a scenario on pseudo-terminals, where they answer like real boards on serial ports."""
     if poses:
         check_output(poses, force=force)
+        check_apart({"poses": poses}, filter(None, (scenario, faults, antenna_delays)))
     loaded = _loaded(scenario, overrides, allow_files, antenna_delays)
     wrong = uwbsim.load_faults(faults, [tag.id for tag in loaded.tags]) if faults else None
     served = uwbsim.Server.extended(loaded, duration)
