@@ -52,7 +52,11 @@ def curves(results: Results) -> list[Block]:
 def _over_power(known: tuple[Any, Any, Any], which: Any) -> Draw:
     """Return a function that draws a curve at a width; errors are binned once for all widths."""
     found = cache(lambda: figures.over_power(*known, which))
-    return lambda width: figures.alone(lambda axes: figures.curve_over_power(*known, which, axes, found()), width)
+
+    def draw(axes: figures.Axes) -> figures.Axes:
+        return figures.curve_over_power(*known, which, axes, found())
+
+    return partial(figures.single_figure, draw)
 
 
 def patterns(results: Results) -> list[Block]:

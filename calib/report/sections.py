@@ -248,7 +248,7 @@ def _delays(results: Results) -> list[Block]:
     columns = {name: cells for name, cells in columns.items() if any(cells)}
     table = Table(list(columns), list(map(list, zip(*columns.values(), strict=True))))
     caption = "Antenna delays with their 95 % intervals" + (", and planted delays in the same gauge." if known else ".")
-    draw = partial(figures.alone, partial(figures.delays, calibration, known, shift))
+    draw = partial(figures.single_figure, partial(figures.delays, calibration, known, shift))
     blocks = [Heading("Antenna delays"), *of_pairs, table, Picture("delays", draw, caption)]
     if planted:
         differs = (
