@@ -21,8 +21,8 @@ import calib
 from benchmarks.directions import PLANTED, SOUND, Recipe, flight, pattern_m
 from calib.evaluation import Settings
 from calib.evaluation.localization import consistency
-from tests.calib.estimation.test_sessions import drifting
 from tests.calib.evaluation import drifting_flight
+from tests.calib.fitting.test_sessions import drifting
 from uwblink.arrays import Floats
 
 PAGE = Path(__file__).parents[1] / "docs" / "accuracy.md"

@@ -1,7 +1,7 @@
 """How far delays are to be trusted where errors depend on places: the table of rooms in docs/accuracy.md.
 
 Scenarios whose errors all come from one room's geometry, others that have nothing of it, and fields of errors of
-`tests.calib.estimation.fields`, which share no code with the simulator. Seeds are those from `FIRST_REPORTED` on, which
+`tests.calib.fitting.fields`, which share no code with the simulator. Seeds are those from `FIRST_REPORTED` on, which
 were not used for tuning. Errors of delays are those about their mean, because a scenario's planted curve and the fitted
 one are zero at different powers.
 """
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 import calib
 from benchmarks.trajectories import localized_m, scenario
-from tests.calib.estimation.fields import ranges_with_field
+from tests.calib.fitting.fields import ranges_with_field
 
 PAGE: Final = Path(__file__).parents[1] / "docs" / "accuracy.md"
 FIRST_REPORTED: Final = 10_000

@@ -5,11 +5,20 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, stats
 
 from uwblink.arrays import Floats, Ints
 
-__all__ = ["SIGMA_OF_MAD", "STD_OF_MEDIAN", "TWO_SIDED_95", "less_medians", "medians", "robust_spread", "spreads"]
+__all__ = [
+    "SIGMA_OF_MAD",
+    "STD_OF_MEDIAN",
+    "TWO_SIDED_95",
+    "less_medians",
+    "medians",
+    "radius_95",
+    "robust_spread",
+    "spreads",
+]
 
 TWO_SIDED_95: Final = 1.959963984540054
 """97.5 % quantile of the standard normal distribution: half of a 95 % interval, in standard deviations."""
@@ -19,6 +28,16 @@ SIGMA_OF_MAD: Final = 1.4826
 
 STD_OF_MEDIAN: Final = 1.2533
 """Ratio of the standard errors of the median and of the mean of many normal values: the root of pi/2."""
+
+
+def radius_95(covariance: Floats) -> float:
+    """Return the distance from the mean within which 95 % of a normal distribution with a covariance (k, k) lie.
+
+    The squared distance is taken as a scaled chi-square with the same mean and variance (Satterthwaite 1946), which is
+    exact for equal variances, also if some of them are zero.
+    """
+    mean, square = float(np.trace(covariance)), float(np.sum(np.square(covariance)))
+    return float(np.sqrt(stats.chi2.ppf(0.95, mean**2 / square) * square / mean)) if mean > 0 else 0.0
 
 
 def robust_spread(values: Floats, centre: float | None = None) -> float:

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +18,17 @@ from docs.site import commands, doors, file_keys
 from uwblink.boards import ranging_plan
 from uwblink.importers import column_map
 from uwblink.text_files import heads
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_files_that_pages_name_exist():
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]
+    named = {(page.name, name) for page in pages for name in re.findall(r"`([^`\s]+)`", page.read_text("utf-8"))}
+    folders = tuple(f"{folder}/" for folder in ("calib", "uwblink", "uwbsim", "tests", "benchmarks", "docs", ".ci"))
+    files = {row for row in named if row[1].startswith(folders) and not set("*<{") & set(row[1])}
+    assert len(files) > 30
+    assert [row for row in sorted(files) if not any((ROOT / (row[1] + end)).exists() for end in ("", ".py"))] == []
 
 
 @pytest.mark.parametrize("keys", [column_map.MAP_KEYS, ranging_plan.PLAN_KEYS], ids=["map", "plan"])

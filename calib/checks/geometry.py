@@ -305,7 +305,7 @@ def _line(view: RecordingView, tag: Tag, away_m: Floats | float = 0.0) -> str:
 
 
 def _exchanged(view: RecordingView, fit: QuickFit) -> tuple[dict[int, int], Candidate]:
-    """Yield the finding of exchanged tags, with the exchange that undoes it.
+    """Return the tag at whose position each exchanged tag is, and the candidate.
 
     If tag a is at the place of b, its ranges to c are the distances from b to c, which are interpolated from the true
     distances of b and c. The log likelihood is the sum of the logarithms of the pairs' spreads, with a separate scale

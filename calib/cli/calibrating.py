@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -243,8 +242,7 @@ def _arrangement_lines(result: calib.SurveyResult) -> Iterator[str]:
         yield f"  arrangement {one.name}{shape}: {one.frame}"
         for board in one.boards:
             place = "  ".join(f"{value:+8.3f}" for value in board.position_m)
-            half = 196 * math.sqrt(max(float(board.covariance_m2.trace()), 0.0))
-            known = f"± {half:.1f} cm (95 %)" if board.determined else "undetermined"
+            known = f"± {100 * board.within_m:.1f} cm (95 %)" if board.determined else "undetermined"
             yield f"    tag {board.tag:3d}  {place} m  {known}"
 
 

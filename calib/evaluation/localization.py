@@ -290,7 +290,7 @@ def fixed_std(calibration: Calibration, settings: Settings, training: Data | Fli
     """Return the fixed standard deviations of raw and calibrated ranges, from data before the flight.
 
     In this order: the given one; those with the smallest RMSE on a training flight; those of the errors that the
-    calibration was fitted to; for old calibrations sigma at the median power.
+    calibration was fitted to; without any (surveys, imported calibrations), sigma in the middle of its curve.
     """
     if settings.fixed_std_m is not None:
         return FixedStd(dict.fromkeys(("raw", "calibrated"), settings.fixed_std_m), "given")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from functools import partial
-from math import isfinite, isnan, nan, sqrt
+from math import isfinite, isnan, nan
 from pathlib import Path
 from typing import Any, Final
 
@@ -187,8 +187,7 @@ def _of_survey(made: Any) -> list[Block]:
 
 def _within(one: SurveyedArrangement) -> str:
     """Return the half interval of the least known position of an arrangement's boards, in words."""
-    known = [board for board in one.boards if board.determined]
-    far = [TWO_SIDED_95 * sqrt(max(float(board.covariance_m2.trace()), 0.0)) for board in known]
+    far = [board.within_m for board in one.boards if board.determined]
     return f"± {100 * max(far):.1f} cm" if far else "undetermined"
 
 

@@ -14,6 +14,7 @@ from calib.calibration.model import Calibration, CalibrationResult
 from calib.errors import BadInputError
 from calib.findings import Finding
 from calib.information import Verdict
+from calib.spread import radius_95
 from uwblink.arrays import Floats
 from uwblink.output import write_bytes, write_text
 
@@ -45,6 +46,11 @@ class SurveyedBoard:
     position_m: tuple[float, float, float]
     covariance_m2: Floats
     determined: bool = True
+
+    @property
+    def within_m(self) -> float:
+        """The radius around the position that contains the antenna with a probability of 95 %."""
+        return radius_95(self.covariance_m2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 import calib
 import uwbsim
 from benchmarks.worlds import CLEAN, PLANTED, Recipe, make
-from tests.calib.estimation.fields import ranges_with_field
+from tests.calib.fitting.fields import ranges_with_field
 from tests.calib.synthetic import about_their_mean
 
 pytestmark = pytest.mark.slow

@@ -10,7 +10,7 @@ import calib
 from calib.checks.limits import power_level_warning, power_levels_db
 from calib.data.ranges import concatenate
 from tests.calib import synthetic
-from tests.calib.estimation.fields import ranges_with_field
+from tests.calib.fitting.fields import ranges_with_field
 from tests.calib.synthetic import DELAYS_NS, about_their_mean, bias_m, ranges
 
 
