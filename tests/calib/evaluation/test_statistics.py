@@ -151,7 +151,7 @@ def test_what_is_held_out_was_not_fitted():
         ({"hold_out": 1.0}, calib.BadInputError),
         ({"hold_out": float("nan")}, calib.BadInputError),
         ({"hold_out": 0.3, "fold": "week"}, calib.BadInputError),
-        ({"hold_out": 0.3, "fold": "session"}, calib.UnanswerableError),  # a folder of this name exists
+        ({"hold_out": 0.3, "fold": "session"}, calib.UnanswerableError),  # it has one session
     ],
 )
 def test_settings_that_hold_nothing_out(changes, error):
@@ -159,7 +159,7 @@ def test_settings_that_hold_nothing_out(changes, error):
         calib.fit(calib.sample_flight(), **changes)
 
 
-# A warning if a calibration is evaluated on its fitted recording.
+# Evaluating a calibration on its fitted recording gives a warning.
 
 
 def test_the_recording_is_known_by_what_it_holds_and_not_by_its_name(tmp_path):
