@@ -1,1 +1,1 @@
-"""Speed and memory of the commands people wait for; run with `make bench`."""
+"""Speed, memory and accuracy of the commands and functions; run with `make bench` and other targets of the Makefile."""

@@ -1,8 +1,8 @@
 """Measure the figures of docs/speed.md and print them as a table.
 
-Each figure is the median of several runs after one that is not counted. Whole commands run in processes of their own,
-so that their time and peak memory include start-up, from compiled modules, as an installation has them; the others are
-timed in this process.
+Each figure is the median of several runs, after a first run that is not counted. Commands run in separate processes, so
+that their time and peak memory include start-up; they use compiled modules, as in an installation. The others are timed
+in this process.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ IN_A_ROOM = (
 
 
 def main() -> None:
-    """Print one row a figure."""
+    """Print one row per figure."""
     print(
         f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, "
         f"numpy {np.__version__}, {datetime.datetime.now(tz=datetime.UTC).date()}\n"
@@ -91,7 +91,7 @@ def command(name: str, *arguments: object) -> tuple[float, float]:
 
 
 def one_run(arguments: list[str]) -> tuple[float, float]:
-    """Run once; the operating system's own accounting of the finished process."""
+    """Run a command once; return the time and memory that the operating system reports for the finished process."""
     start = time.perf_counter()
     process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, preexec_fn=one_core)
     _, status, usage = os.wait4(process.pid, 0)
@@ -102,7 +102,7 @@ def one_run(arguments: list[str]) -> tuple[float, float]:
 
 
 def one_core() -> None:
-    """Keep the process that starts here on one core."""
+    """Restrict the process that is started here to one core."""
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
@@ -117,7 +117,7 @@ def timed(work: Callable[[], object]) -> float:
 
 
 def simulating(*settings: str, passive: bool = False, contention: bool = True) -> float:
-    """Return how many exchanges of the training flight are simulated in a second, with settings besides."""
+    """Return the number of simulated exchanges per second for the training flight, with further settings."""
     from uwbsim import simulate
     from uwbsim.scenario.loading import load
 
@@ -127,7 +127,7 @@ def simulating(*settings: str, passive: bool = False, contention: bool = True) -
 
 
 def fitting(recording: Path) -> float:
-    """Return the time to fit what is already in memory, in seconds."""
+    """Return the time of a fit in seconds, with data in memory."""
     from calib.data.sources import load_ranges
     from calib.fitting.fitting import fit
 
@@ -136,7 +136,7 @@ def fitting(recording: Path) -> float:
 
 
 def loading(folder: Path) -> float:
-    """Return the time to read a million random exchanges into columns, in seconds."""
+    """Return the time to read a million random exchanges as columns, in seconds."""
     from uwblink.recording.file import Recording
     from uwblink.twr import COLUMNS, Exchanges
 

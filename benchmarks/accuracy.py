@@ -1,7 +1,8 @@
-"""How well calibrations find what was planted, over many seeds: the first table of docs/accuracy.md.
+"""Errors of fitted calibrations against planted values, over many seeds: the first table of docs/accuracy.md.
 
-Every seed is another noise, another motion, other clocks of the icra2023 training flight. A delay's error is taken
-after the shift common to all delays has been exchanged with the curve's constant, and so is its standard error.
+Each seed gives other noise, motion and clocks for the training flight of icra2023. A common shift of all delays and a
+constant of the curve have the same effect, so errors and standard errors of delays are computed after removing this
+shift.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ BEGIN, END = "<!-- flights -->", "<!-- end of flights -->"
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """One fit: errors of delays over their standard errors (tags,), and rms errors in ps and mm."""
+    """One fit: errors of delays divided by their standard errors (tags,), and rms errors in ps and mm."""
 
     scores: tuple[float, ...]
     delays_ps: float
@@ -35,7 +36,7 @@ class Outcome:
 
 
 def one(share: float, seed: int, duration_s: float | None = None) -> dict[str, Outcome]:
-    """Simulate, fit with each loss, and compare with what was planted."""
+    """Simulate, fit with each loss, and compare with the planted values."""
     import uwbsim
     from calib.data.sources import load_ranges
     from calib.evaluation.statistics import evaluate

@@ -21,7 +21,7 @@ SECONDS = 60.0
 
 
 def main() -> None:
-    """Print one row a figure."""
+    """Print one row per figure."""
     print("| what | goal | measured |\n|---|---|---|")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -38,7 +38,7 @@ def row(what: str, goal: str, figure: str) -> None:
 
 
 def recorded(ports: list[str], path: Path, *more: str) -> tuple[float, str]:
-    """Record in a process of its own; returns its processor time in seconds, and its last line."""
+    """Record in a separate process; return its processor time in seconds, and the last line of its output."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(
         [str(BIN / "uwblink"), "record", *ports, "-o", str(path), "--force", *more], capture_output=True, text=True
@@ -78,7 +78,7 @@ def ten_boards(folder: Path) -> None:
 
 
 def ten_sources(folder: Path, burst: int) -> None:
-    """Each source sends numbered reports; every number must be in the recording."""
+    """Record from ten sources that send numbered reports; every number must be in the recording."""
     from uwblink.recording.file import Recording
 
     words = [sys.executable, "-m", "benchmarks.sources", "10", "200", str(SECONDS), str(burst)]
@@ -123,7 +123,7 @@ def round_trip() -> None:
 
 
 def driver_share() -> None:
-    """A round trip to an answerer in another process that does nothing else: driver, kernel, and its wake-up."""
+    """Measure the round trip to a process that only answers: driver, kernel, and the wake-up of the process."""
     from benchmarks.sources import report
     from uwblink.boards.board import Board
     from uwblink.boards.ports import Terminal
@@ -168,7 +168,7 @@ def decoder() -> None:
     from uwblink.wire.codec import Decoder, exchanges_of
     from uwblink.wire.messages import REPORTS
 
-    reports = [report(k) for k in range(20_000)]  # a piece each, as they come from a port
+    reports = [report(k) for k in range(20_000)]  # one piece each, as read from a port
     rates = []
     for _ in range(6):
         messages, start = Decoder(REPORTS), time.perf_counter()

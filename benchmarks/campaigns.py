@@ -1,7 +1,7 @@
-"""What a training flight needs: length, room, motion and pairs, planted beside fitted, into a tutorial's table.
+"""Requirements of a training flight (duration, room, motion, pairs): errors of fits against planted values, as a table.
 
-`python -m benchmarks.campaigns` writes it into docs/motion-capture.md. Every flight is that of
-scenarios/icra2023/train.toml with one thing changed; what it gives is judged on the test flight, which is not changed.
+`python -m benchmarks.campaigns` writes the table into docs/motion-capture.md. Each flight is
+scenarios/icra2023/train.toml with one change; the result is evaluated on the test flight, which is not changed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Table = dict[str, Any]
 
 
 def lasting(seconds: float) -> Callable[[Table], None]:
-    """Return a change of how long the flight is."""
+    """Return a function that changes the duration of a flight."""
 
     def change(table: Table) -> None:
         table["run"]["duration_s"] = seconds
@@ -44,7 +44,7 @@ def lasting(seconds: float) -> Callable[[Table], None]:
 
 
 def in_boxes_of(size_m: float) -> Callable[[Table], None]:
-    """Return a change of the boxes that bodies fly in: cubes around the middles of theirs."""
+    """Return a function that replaces the boxes in which bodies fly by cubes about the same centres."""
 
     def change(table: Table) -> None:
         for body in table["bodies"]:
@@ -57,7 +57,7 @@ def in_boxes_of(size_m: float) -> Callable[[Table], None]:
 
 
 def hovering(table: Table) -> None:
-    """Have all bodies stand where the middles of their boxes are."""
+    """Place all bodies at the centres of their boxes, without motion."""
     for body in table["bodies"]:
         motion = body["motion"]
         middle = (np.array(motion["box_min_m"]) + np.array(motion["box_max_m"])) / 2
@@ -65,7 +65,7 @@ def hovering(table: Table) -> None:
 
 
 def in_a_row(table: Table) -> None:
-    """Have every tag range with the next one only, so that each pair's constant could be one tag's or the other's."""
+    """Let each tag range only with the next one, so that constants of pairs do not determine delays of tags."""
     table["ranging"]["pairs"] = [[1, 3], [3, 5], [2, 4], [4, 6]]
 
 
@@ -83,7 +83,7 @@ CASES: Final[dict[str, Callable[[Table], None]]] = {
 
 
 def judged(case: str, seed: int) -> list[float] | str:
-    """Return the figures of a case with a seed, or why there are none."""
+    """Return the results of a case with a seed, or the error of its fit."""
     table = copy.deepcopy(tomllib.loads((FLIGHTS / "train.toml").read_text(encoding="utf-8")))
     table["run"] |= {"duration_s": LENGTH_S, "seed": seed}
     CASES[case](table)
@@ -101,7 +101,7 @@ def judged(case: str, seed: int) -> list[float] | str:
 
 
 def row(case: str, seeds: int) -> str:
-    """Return a case's row of the table: medians over seeds."""
+    """Return the row of a case: medians over seeds."""
     outcomes = [judged(case, seed) for seed in range(1, seeds + 1)]
     figures = [outcome for outcome in outcomes if not isinstance(outcome, str)]
     if not figures:

@@ -1,8 +1,8 @@
-"""How much results depend on constants: each is halved and doubled in a copy of the packages, which fits again.
+"""Sensitivity of results to constants: each is halved and doubled in a copy of the packages, which fits again.
 
-`python -m benchmarks.constants [NAME ...]` fits some of the golden cases (`benchmarks.golden`) and prints, by constant
+`python -m benchmarks.constants [NAME ...]` fits some of the golden cases (`benchmarks.golden`). It prints, by constant
 and factor, the largest change of a delay in standard errors, and the smallest and largest ratio of standard errors.
-Comments beside the constants cite it. Whole numbers stay whole; of a tuple or a table every number is changed.
+Comments beside constants cite it. Integers remain integers; in a tuple or a table, all numbers are changed.
 """
 
 from __future__ import annotations
@@ -71,7 +71,9 @@ def changed(source: str, name: str, factor: float) -> str:
 
 
 def outcomes(room: str, module: str = "", name: str = "", factor: float = 1.0) -> dict[str, Any]:
-    """Return the outcomes of a room's golden cases, by name, with a constant of a module of it times a factor."""
+    """Return the outcomes of the golden cases of a package, by name, with a constant of one of its modules times a
+    factor.
+    """
     with tempfile.TemporaryDirectory() as folder:
         for part in ("calib", "uwbsim", "uwblink", "benchmarks", "tests", "scenarios"):
             shutil.copytree(ROOT / part, Path(folder, part), ignore=shutil.ignore_patterns("__pycache__", "golden"))
@@ -92,7 +94,7 @@ def outcomes(room: str, module: str = "", name: str = "", factor: float = 1.0) -
 
 
 def main(wanted: list[str]) -> int:
-    """Print a line a constant, factor and case."""
+    """Print a line per constant, factor and case."""
     tried = [
         (room, module, name, factor)
         for (room, module), names in STUDIED.items()

@@ -1,4 +1,4 @@
-"""What delays depend on: planted patterns over direction, slopes over temperature, drifts, and what is found of them.
+"""Dependences of delays: planted patterns over direction, slopes over temperature and drifts, and the results of fits.
 
 The worlds share no code with the packages: `benchmarks.directions`, and those of the tests of sessions and filters.
 `make dependences` writes the table in docs/accuracy.md.
@@ -27,7 +27,7 @@ from uwblink.arrays import Floats
 
 PAGE = Path(__file__).parents[1] / "docs" / "accuracy.md"
 FIRST_SEED = 700
-"""Others than those with which anything was chosen (41 to 316)."""
+"""Seeds that were not used to choose anything (seeds 41 to 316 were)."""
 
 TWO_SIDED_95 = 1.96
 KINDS: dict[str, list[Recipe]] = {
@@ -45,15 +45,16 @@ DRIFTS_M: tuple[dict[int, float], ...] = (
     dict.fromkeys(drifting_flight.DELAYS_NS, 0.0215) | {1: 0.2},
     {1: 0.2, 2: 0.2},
 )
-"""In a filter: nothing drifts; one tag by 2 cm/K over 10 K, others by 2.15 mm/K; both tags of the robot."""
+"""Drifts in flights of filters: none; one tag by 2 cm/K over 10 K and others by 2.15 mm/K; both tags of the robot."""
 OFFSETS_M = (0.0, 0.02, 0.05)
-"""In a filter: constants of pairs, standard deviations in metres."""
+"""Standard deviations of the constants of pairs in flights of filters, in metres."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """What is found in a world: whether there is something, by how much errors of another flight change by knowing it,
-    and which shares of what was planted are within 95 % intervals."""
+    """Result in one world: whether a dependence was found, the relative change of the errors of another flight by the
+    fitted dependence, and the shares of planted values within 95 % intervals.
+    """
 
     found: bool
     change: float = np.nan
@@ -61,7 +62,7 @@ class Outcome:
 
 
 def flown(recipe: Recipe, seed: int) -> Outcome:
-    """Return what a fit finds of a pattern or slope; where tags warm up, another flight is 15 K warmer."""
+    """Return the result of a fit with a pattern or slope. If tags warm up, the other flight is 15 K warmer."""
     warm = recipe.warmer_k > 0
     warmer = replace(recipe, start_c=recipe.start_c + recipe.warmer_k)
     (first, planted), (second, _) = flight(recipe, seed), flight(warmer, seed, 1)
@@ -78,15 +79,15 @@ def flown(recipe: Recipe, seed: int) -> Outcome:
 
 
 def _error_m(flown: Any, known: calib.Calibration) -> float:
-    """Return the size of errors of corrected ranges, of which reflections are not a part."""
+    """Return the size of errors of corrected ranges, without reflections."""
     found = calib.evaluate(flown, known).overall.full
     return float(np.hypot(found.median_m, found.robust_std_m))
 
 
 def _patterns_inside(known: calib.Calibration, ranges: calib.Ranges, waves: Floats, size_m: float) -> list[float]:
-    """Return for each fitted pattern the share of fitted directions in whose 95 % interval the planted one is.
+    """Return, for each fitted pattern, the share of fitted directions whose 95 % interval contains the planted value.
 
-    Both are about their means over these directions, because delays contain what is the same in all.
+    Both patterns are compared relative to their means over these directions, because delays contain the mean.
     """
     ends, shares = np.column_stack([ranges.initiator, ranges.target]), []
     for one in known.patterns:
@@ -99,13 +100,13 @@ def _patterns_inside(known: calib.Calibration, ranges: calib.Ranges, waves: Floa
 
 
 def _slopes_inside(known: calib.Calibration, mm_per_k: Floats) -> list[float]:
-    """Return 1 for each fitted slope in whose 95 % interval the planted one is, else 0."""
+    """Return 1 for each fitted slope whose 95 % interval contains the planted slope, else 0."""
     off = [(one.m_per_k - 1e-3 * mm_per_k[one.tags[0]]) / one.std_m_per_k for one in known.temperatures]
     return [float(abs(one) <= TWO_SIDED_95) for one in off]
 
 
 def sessions(rate_m2: float, seed: int) -> Outcome:
-    """Return what a fit of sessions on some days finds of a walk of delays with a variance a day."""
+    """Return the result of a fit of sessions on several days, with random walks of delays of a variance per day."""
     days = np.cumsum([0, *np.random.default_rng([seed, 5]).uniform(2, 15, 2 + seed % 4)])
     one = calib.fit(drifting(seed, days, rate_m2)).calibration.provenance["drift"]
     low, _, high = one["m2_per_day"]
@@ -113,15 +114,17 @@ def sessions(rate_m2: float, seed: int) -> Outcome:
 
 
 def filtered(name: str, kind: str, cases: Sequence[dict[str, Any]], seeds: Sequence[int]) -> list[str]:
-    """Return a row on filters of a `kind` in flights of some cases: NEES with its bounds, and RMSE beside a filter
-    with fixed delays and without constants of pairs."""
+    """Return a row on filters of a `kind` in flights of some cases.
+
+    It has the NEES with its bounds, and the RMSE, also of a filter with fixed delays and without constants of pairs.
+    """
     fixed, known = (
         calib.fit(drifting_flight.flight(100, 60.0)[0], between_m=value).calibration for value in (0.0, None)
     )
     cells = []
     for case in cases:
         flights = [drifting_flight.flight(seed, **case)[0] for seed in seeds]
-        # Delays as states are judged alone.
+        # Filters with delays as states are evaluated alone.
         by, online = fixed if kind == "online" else known, Settings(seeds=1, online=kind == "online")
         found = [calib.localize(one, by, online)[0].tracks[kind] for one in flights]
         beside = [calib.localize(one, fixed, Settings(seeds=1))[0].tracks["robust"] for one in flights]
@@ -129,12 +132,12 @@ def filtered(name: str, kind: str, cases: Sequence[dict[str, Any]], seeds: Seque
         nees, (low, high), _ = consistency(found)
         cells.append((f"{nees:.1f}", f"{100 * change:+.1f}"))
     texts = [", ".join(some) for some in zip(*cells, strict=True)]
-    # Flights of one length: bounds of all cases are about those of the last.
+    # All flights have one duration, so bounds of the last case apply to all.
     return [name, f"NEES {texts[0]} ({low:.1f} to {high:.1f})", f"{texts[1]} %", ""]
 
 
 def row(name: str, cases: Sequence[Sequence[Outcome]]) -> list[str]:
-    """Return a row on cases, each with its outcomes in several worlds."""
+    """Return a row on several cases, each with its results in several worlds."""
     found = [sum(one.found for one in worlds) for worlds in cases]
     changes = [100 * np.mean([one.change for one in worlds]) for worlds in cases]
     inside = [100 * np.mean(every) for worlds in cases if (every := [part for one in worlds for part in one.inside])]
@@ -147,7 +150,7 @@ def row(name: str, cases: Sequence[Sequence[Outcome]]) -> list[str]:
 
 
 def main() -> None:
-    """Print the table, and write it into docs/accuracy.md if asked to."""
+    """Print the table, and write it into docs/accuracy.md with `--write`."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=20, help="worlds of each kind")
     parser.add_argument("--write", action="store_true", help="write docs/accuracy.md")
@@ -156,7 +159,7 @@ def main() -> None:
     lines = ["| planted | found | another flight | inside 95 % |", "|---|---|---|---|"]
     for name, recipes in track(KINDS.items(), description="worlds"):
         planted = bool(recipes[0].pattern_m or recipes[0].mm_per_k)
-        # Flights of all kinds without anything are one case.
+        # Flights without a dependence, of all kinds, are one case.
         cases = [[one] for one in recipes] if planted else [recipes]
         lines.append(_line(row(name, [[flown(*world) for world in product(case, seeds)] for case in cases])))
     walks = [[sessions(rate_m2, seed) for seed in seeds] for rate_m2 in RATES_M2]

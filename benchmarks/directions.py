@@ -1,7 +1,8 @@
-"""Flights whose antennas delay by direction and temperature, by a generator that shares no code with fits.
+"""Flights with delays that depend on direction and temperature, by a generator that shares no code with fits.
 
-Robots fly on sums of sines and turn about all axes; each carries a tag. What an antenna adds is a sum of waves over
-azimuth, faded towards its poles, and no spherical harmonic. `benchmarks.dependences` says what fits find.
+Robots move on sums of sines and turn about all axes; each has one tag. The effect of an antenna is a sum of waves over
+azimuth that vanishes towards the poles, and not a spherical harmonic. `benchmarks.dependences` evaluates fits of these
+flights.
 """
 
 from __future__ import annotations
@@ -25,15 +26,15 @@ POSES_HZ = 50
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recipe:
-    """What a flight is made of; lengths in metres, times in seconds.
+    """Parameters of a flight; lengths are in metres, times in seconds.
 
-    `pattern_m` is by how much ranges of a turning robot differ over directions, from the shortest to the longest. With
-    `own` each antenna has a pattern of its own. `turning` is the share of a full turn to which attitudes are confined,
-    0 for robots that never turn. `wall_m` is the standard deviation of an offset of each pair, `wander_m` that of an
-    error of each pair that forgets itself within three seconds, `room_m` that of an error of each pair that depends on
-    the place of its first robot. Robots that fly a `loop` head along it, so that directions follow places. Tags warm
-    up by `warmer_k`, from `start_c` in some tens of seconds, and say so each second; each end makes ranges longer by
-    `mm_per_k`, of which tags differ by the standard deviation `apart_mm_per_k`.
+    `pattern_m` is the difference between the longest and the shortest range of a turning robot over directions; with
+    `own`, each antenna has its own pattern. `turning` is the share of a full turn that attitudes cover, 0 for robots
+    that do not turn. Errors of pairs: `wall_m` is the standard deviation of a constant offset, `wander_m` that of an
+    error with a correlation time of three seconds, and `room_m` that of an error that depends on the position of the
+    pair's first robot. Robots on a `loop` head along it, so that directions depend on positions. Tags warm up by
+    `warmer_k` from `start_c` within some tens of seconds and report their temperature each second; each end lengthens
+    ranges by `mm_per_k`, which differs between tags by the standard deviation `apart_mm_per_k`.
     """
 
     robots: int = 4
@@ -56,14 +57,14 @@ class Recipe:
 
 
 def waves(rng: np.random.Generator, recipe: Recipe) -> Floats:
-    """Return heights and phases of two waves over azimuth, (tags + 1, 2, 2); the first wave is the larger."""
+    """Return amplitudes and phases of two waves over azimuth, (tags + 1, 2, 2); the first wave is the larger one."""
     tags = recipe.robots + recipe.anchors + 1
     found = np.stack([np.tile([1.0, 0.35], (tags, 1)), rng.uniform(0, 2 * np.pi, (tags, 2))], axis=-1)
     return found if recipe.own else np.repeat(found[:1], tags, axis=0)
 
 
 def pattern_m(direction: Floats, wave: Floats, size_m: float) -> Floats:
-    """Return what an antenna adds to ranges (n,) towards unit vectors (n, 3) in its body's frame."""
+    """Return the effect of an antenna on ranges (n,) in directions (n, 3), unit vectors in the frame of its body."""
     azimuth = np.arctan2(direction[:, 1], direction[:, 0])
     level = np.sqrt(np.clip(1 - direction[:, 2] ** 2, 0, 1))
     around = sum(h * np.cos((k + 1) * azimuth - phase) for k, (h, phase) in enumerate(wave))
@@ -71,7 +72,7 @@ def pattern_m(direction: Floats, wave: Floats, size_m: float) -> Floats:
 
 
 def flight(recipe: Recipe, seed: int, number: int = 0) -> tuple[Contents, dict[str, Any]]:
-    """Return a flight as a recording would hold it, and what was planted; flights of one seed have the same boards."""
+    """Return a flight in the form of a recording, and the planted values; flights of one seed have the same boards."""
     boards, rng = np.random.default_rng([seed, 5_150]), np.random.default_rng([seed, 5_150, number + 1])
     count, tags = int(recipe.seconds * recipe.per_second), recipe.robots + recipe.anchors
     delays_ns, wave = boards.uniform(-0.4, 0.3, tags + 1), waves(boards, recipe)
@@ -145,7 +146,7 @@ def flight(recipe: Recipe, seed: int, number: int = 0) -> tuple[Contents, dict[s
 
 
 def _motion(rng: np.random.Generator, recipe: Recipe) -> Any:
-    """Return a function of tag and times that returns places (n, 3) and attitudes (n, 3, 3)."""
+    """Return a function of tag and times that returns positions (n, 3) and attitudes (n, 3, 3)."""
     tags = recipe.robots + recipe.anchors + 1
     angle = 2 * np.pi * (np.arange(tags) + rng.uniform(0, 0.5, tags)) / max(tags - 1, 1)
     reach = np.where(np.arange(tags) <= recipe.robots, 2.2, 5.0)
@@ -169,7 +170,7 @@ def _motion(rng: np.random.Generator, recipe: Recipe) -> Any:
 
 
 def _turn(angle: Floats, axis: int) -> Floats:
-    """Return rotations (n, 3, 3) about an axis of the coordinates."""
+    """Return rotations (n, 3, 3) about a coordinate axis."""
     found = np.tile(np.eye(3), (len(angle), 1, 1))
     one, other = [k for k in range(3) if k != axis]
     found[:, one, one] = found[:, other, other] = np.cos(angle)
@@ -197,7 +198,9 @@ def _quaternions(turn: Floats) -> Floats:
 
 
 def _room(boards: np.random.Generator, first: Floats, second: Floats, ends: Any, which: Any) -> Floats:
-    """Return an error of unit variance that depends on the place of a pair's lower tag, smooth over half a metre."""
+    """Return an error of unit variance that depends on the position of the lower tag of a pair, smooth over half a
+    metre.
+    """
     place, found = np.where((ends[:, 0] < ends[:, 1])[:, None], first, second), np.zeros(len(which))
     for pair in range(int(which.max()) + 1):
         turns, phases = boards.normal(0, 2.0, (4, 3)), boards.uniform(0, 2 * np.pi, 4)
@@ -207,7 +210,7 @@ def _room(boards: np.random.Generator, first: Floats, second: Floats, ends: Any,
 
 
 def _wander(rng: np.random.Generator, recipe: Recipe, time_s: Floats, which: Any) -> Floats:
-    """Return an error of unit variance for each pair that forgets itself within three seconds."""
+    """Return an error of unit variance for each pair with a correlation time of three seconds."""
     grid = np.arange(0, recipe.seconds + 0.2, 0.1)
     found = np.zeros(len(time_s))
     for pair in np.unique(which):

@@ -1,7 +1,7 @@
-"""Faults planted in flights that share nothing with the simulator nor with the doctor, and what the doctor says.
+"""Faults planted in flights that share no code with simulator and doctor, and the findings of the doctor.
 
-Writes the table of docs/doctor.md: hits, and whatever else was said. Seeds are those from `FIRST_REPORTED` on, which
-have chosen no threshold; `--tuning` takes those that have.
+Writes the table of docs/doctor.md: detected faults, and other findings. Seeds start at `FIRST_REPORTED`; they were not
+used to choose thresholds. `--tuning` uses the earlier seeds, which were.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ BEGIN, END = "<!-- table -->", "<!-- end of table -->"
 SEEDS: Final = 4
 CLEAN_SEEDS: Final = 10
 OF_FAULTS: Final = 700
-"""Where seeds of faults begin, after the first."""
+"""First seeds of the other faults."""
 
 SCENARIO: Final = Path(__file__).parents[1] / "scenarios" / "icra2023" / "test1.toml"
 VACUUM: Final = 299_792_458.0 / LIGHT
@@ -41,7 +41,7 @@ STAMPS: Final = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A kind of fault: the flight it is planted in, how, and the names by which the doctor may call it."""
+    """A kind of fault: the flight, a function that plants it, and the names of findings that count as detection."""
 
     name: str
     plan: Plan
@@ -56,17 +56,17 @@ def changed(flight: Flight, **columns: Any) -> Flight:
 
 
 def of_tag(flight: Flight, tag: int) -> Any:
-    """Return which exchanges are a tag's."""
+    """Return a mask of the exchanges of a tag."""
     return (flight.exchanges.initiator == tag) | (flight.exchanges.target == tag)
 
 
 def seconds(flight: Flight) -> Any:
-    """Return when exchanges were."""
+    """Return the times of exchanges in seconds."""
     return flight.exchanges.time_ns * 1e-9 - 1
 
 
 def longer(flight: Flight, metres: Any) -> Flight:
-    """Return a flight whose ranges (n,) are longer: the initiator receives later."""
+    """Return a flight whose ranges (n,) are longer, by later receive stamps of the initiator."""
     e = flight.exchanges
     late, mask = np.rint(2 * np.broadcast_to(metres, len(e)) / LIGHT * TICKS).astype(np.int64), (1 << e.bits) - 1
     third = (e.protocol == "ds") & (e.rx3 != 0)
@@ -75,7 +75,7 @@ def longer(flight: Flight, metres: Any) -> Flight:
 
 
 def corrupt(flight: Flight, rng: np.random.Generator, share: float) -> Flight:
-    """Replace stamps of some rows by any."""
+    """Replace stamps of some rows by random numbers."""
     hit = rng.random(len(flight.exchanges)) < share
     which, e = rng.integers(0, 6, len(hit)), flight.exchanges
     found = {
@@ -86,20 +86,20 @@ def corrupt(flight: Flight, rng: np.random.Generator, share: float) -> Flight:
 
 
 def stepped(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Change a tag's delay by 0.3 to 1.2 ns at some time."""
+    """Change the delay of a tag by 0.3 to 1.2 ns at some time."""
     size = float(rng.choice([-1, 1]) * rng.uniform(0.3, 1.2)) * LIGHT * 1e-9 / 2
     at = rng.uniform(0.2, 0.8) * seconds(flight).max()
     return longer(flight, np.where(of_tag(flight, tag_of(flight, rng)) & (seconds(flight) > at), size, 0.0))
 
 
 def drifting(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Let a tag's delay drift by a nanosecond."""
+    """Let the delay of a tag drift by a nanosecond."""
     part = seconds(flight) / seconds(flight).max()
     return longer(flight, np.where(of_tag(flight, tag_of(flight, rng)), 0.15 * part, 0.0))
 
 
 def tag_of(flight: Flight, rng: np.random.Generator) -> int:
-    """Return one of the tags that move."""
+    """Return a tag on a moving body."""
     return int(rng.choice([tag.tag for tag in flight.tags if tag.tag < 100]))
 
 
@@ -109,7 +109,7 @@ def pair_off(flight: Flight, rng: np.random.Generator) -> Flight:
 
 
 def longer_pair(flight: Flight, rng: np.random.Generator, metres: float | None) -> Flight:
-    """Make the ranges of one pair longer, by 12 to 30 cm where nothing is said."""
+    """Lengthen the ranges of one pair, by default by 12 to 30 cm."""
     e = flight.exchanges
     pairs = np.unique(np.sort(np.column_stack([e.initiator, e.target]), axis=1), axis=0)
     a, b = pairs[rng.integers(0, len(pairs))]
@@ -118,7 +118,7 @@ def longer_pair(flight: Flight, rng: np.random.Generator, metres: float | None) 
 
 
 def swapped_roles(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Exchange initiator and target, and what they measured."""
+    """Exchange initiators and targets, and their measurements."""
     e = flight.exchanges
     return changed(
         flight, initiator=e.target, target=e.initiator, fpp1_dbm=e.fpp2_dbm, fpp2_dbm=e.fpp1_dbm,
@@ -139,24 +139,24 @@ def swapped_tags(flight: Flight, rng: np.random.Generator) -> Flight:
 
 
 def turned_arms(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Change the sign of a body's lever arms."""
+    """Change the signs of the lever arms of a body."""
     body = f"drone{rng.integers(1, 4)}"
     return arms(flight, lambda tag: tuple(-v for v in tag.lever_arm_m) if tag.body == body else tag.lever_arm_m)
 
 
 def wxyz(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Write quaternions in the other order."""
+    """Write quaternions in the order w, x, y, z."""
     return replace(flight, poses=replace(flight.poses, quaternion=flight.poses.quaternion[:, [3, 0, 1, 2]]))
 
 
 def inverse_attitudes(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Write quaternions from the world to the body."""
+    """Write quaternions that rotate from the world to the body."""
     return replace(flight, poses=replace(flight.poses, quaternion=flight.poses.quaternion * [-1, -1, -1, 1]))
 
 
 def turned_attitudes(flight: Flight, rng: np.random.Generator, *, body: str = "") -> Flight:
-    """Turn the attitudes in the world by 30 to 150 degrees, or those of a body about the vertical of its own frame."""
-    # A turn about the line through the tags of a body changes nothing; one by 180 degrees exchanges the tags.
+    """Rotate the attitudes in the world by 30 to 150 degrees, or those of a body about its own vertical axis."""
+    # A rotation about the line through the tags of a body has no effect; one by 180 degrees exchanges the tags.
     axis, given = np.array([0.0, 0.0, 1.0]) if body else rng.normal(size=3), Rotation.from_quat(flight.poses.quaternion)
     turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(np.pi / 6, 5 * np.pi / 6))
     turned = (given * turn if body else turn * given).as_quat()
@@ -171,7 +171,7 @@ def turned_arm(flight: Flight, rng: np.random.Generator) -> Flight:
 
 
 def other_origin(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Write a body's poses from another origin, 0.4 to 0.8 m away."""
+    """Write the poses of a body relative to another origin, 0.4 to 0.8 m away."""
     mine, way = flight.poses.body == f"drone{rng.integers(1, 4)}", rng.uniform(0, 2 * np.pi)
     shift = rng.uniform(0.4, 0.8) * np.array([np.cos(way), np.sin(way), 0.0])
     position_m = flight.poses.position_m + np.where(mine[:, None], shift, 0.0)
@@ -179,7 +179,7 @@ def other_origin(flight: Flight, rng: np.random.Generator) -> Flight:
 
 
 def rare_poses(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Keep a pose in two seconds."""
+    """Keep one pose per two seconds."""
     kept = [np.flatnonzero(flight.poses.body == body) for body in np.unique(flight.poses.body)]
     every = [rows[:: round(2e9 / np.median(np.diff(flight.poses.time_ns[rows])))] for rows in kept]
     return replace(flight, poses=flight.poses[np.sort(np.concatenate(every))])
@@ -205,13 +205,13 @@ def clock_set_back(flight: Flight, rng: np.random.Generator) -> Flight:
 
 
 def late_poses(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Let the clock of the poses be off."""
+    """Shift the clock of the poses."""
     shift = int(rng.choice([-1, 1]) * rng.uniform(0.15, 1.5) * 1e9)
     return replace(flight, poses=replace(flight.poses, time_ns=flight.poses.time_ns + shift))
 
 
 def late_truths(flight: Flight, by_ns: int) -> Flight:
-    """Give true distances in the table, of a time that is later by so much, and no poses."""
+    """Replace poses by true distances in the table, taken at later times."""
     e = flight.exchanges
     truth_m = distances_m(flight.poses, flight.tags, e.initiator, e.target, e.time_ns + by_ns)
     return replace(changed(flight, truth_m=truth_m), poses=flight.poses[:0])
@@ -229,7 +229,7 @@ def dead(flight: Flight, rng: np.random.Generator) -> Flight:
 
 
 def moved_anchor(flight: Flight, rng: np.random.Generator, *, plan: Plan, both: bool) -> Flight | list[Flight]:
-    """Let an anchor stand 20 to 60 cm from where the recording says; in the second of two recordings, if `both`."""
+    """Displace an anchor by 20 to 60 cm from its recorded position; in the second of two recordings, if `both`."""
     away = rng.normal(size=3)
     away *= rng.uniform(0.2, 0.6) / np.linalg.norm(away)
     which = int(rng.integers(0, plan.anchors))
@@ -239,7 +239,7 @@ def moved_anchor(flight: Flight, rng: np.random.Generator, *, plan: Plan, both: 
 
 
 def all_anchors_off(flight: Any, rng: np.random.Generator) -> Any:
-    """Let each anchor stand 10 cm from where the recording says, in any direction."""
+    """Displace each anchor by 10 cm from its recorded position, in a random direction."""
     position_m = flight.poses.position_m.copy()
     for body in np.unique(flight.poses.body):
         away = rng.normal(size=3)
@@ -254,7 +254,7 @@ def named(flight: Flight, name: str) -> Flight:
 
 
 def other_delay(flight: Flight, rng: np.random.Generator, *, plan: Plan) -> list[Flight]:
-    """Change a tag's delay by 0.5 to 1.2 ns between two recordings."""
+    """Change the delay of a tag by 0.5 to 1.2 ns between two recordings."""
     seed = int(rng.integers(0, 2**31))
     second = fly(plan, seed + 1, 1)
     size = float(rng.choice([-1, 1]) * rng.uniform(0.5, 1.2)) * LIGHT * 1e-9 / 2
@@ -263,20 +263,20 @@ def other_delay(flight: Flight, rng: np.random.Generator, *, plan: Plan) -> list
 
 
 def two(flight: Flight, rng: np.random.Generator, *, plan: Plan) -> list[Flight]:
-    """Return two recordings of the same boards with nothing planted."""
+    """Return two recordings of the same boards without a fault."""
     seed = int(rng.integers(0, 2**31))
     return [named(fly(plan, seed + k, 1), str(k)) for k in range(2)]
 
 
 def few_pairs(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Leave two bodies, whose tags range with the other's only, and corrupt 130 rows."""
+    """Keep two bodies, whose tags range only with each other's, and corrupt 130 rows."""
     e = flight.exchanges
     some = replace(flight, exchanges=e[(e.initiator < 30) & (e.target < 30)])
     return corrupt(some, rng, 130 / len(some.exchanges))
 
 
 def still(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Keep true distances as they were measured by a tape, and ranges near them."""
+    """Replace true distances by constants, as measured with a tape, and move ranges near them."""
     e = flight.exchanges
     tape = 2.0 + 0.1 * ((e.initiator + e.target) % 17)
     known = calib.Ranges.from_exchanges(e, poses=flight.poses, tags=flight.tags).truth_m
@@ -284,7 +284,7 @@ def still(flight: Flight, rng: np.random.Generator) -> Flight:
 
 
 def still_open(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Let nothing move, and a pair be 45 cm longer than the tape says."""
+    """Let nothing move, and make the ranges of a pair 45 cm longer than the measured distance."""
     return longer_pair(still(flight, rng), rng, 0.45)
 
 
@@ -308,20 +308,20 @@ def without_stamps(flight: Flight, rng: np.random.Generator, *, many: float) -> 
 
 
 def other_powers(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Write powers as losses, or as hundredths."""
+    """Write powers as path losses, or in hundredths of a dBm."""
     e, factor = flight.exchanges, float(rng.choice([-1.0, 100.0, -100.0, 256.0]))
     return changed(flight, fpp1_dbm=e.fpp1_dbm * factor, fpp2_dbm=e.fpp2_dbm * factor)
 
 
 def doubled(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Let a third of the exchanges stand twice, as where two robots log them."""
+    """Repeat a third of the exchanges, as in logs of two robots."""
     e = flight.exchanges
     twice = np.sort(np.concatenate([np.arange(len(e)), np.flatnonzero(rng.random(len(e)) < 0.35)]))
     return replace(flight, exchanges=e[twice])
 
 
 def exchanged_anchors(flight: Flight, rng: np.random.Generator, *, given: bool, count: int = 2) -> Flight:
-    """Give some anchors each the next one's place, in the poses or in `given` true distances."""
+    """Give each of some anchors the position of the next one, in the poses or in `given` true distances."""
     some = rng.permutation(4)[:count].tolist()
     number = {f"anchor{a}": f"anchor{b}" for a, b in zip(some, [*some[1:], some[0]], strict=True)}
     body = np.array([number.get(name, name) for name in flight.poses.body.tolist()])
@@ -333,7 +333,7 @@ def exchanged_anchors(flight: Flight, rng: np.random.Generator, *, given: bool, 
 
 
 def noisy_powers(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Let powers follow distance, but for the noise of readings, which leaves it 59 % of the variance."""
+    """Make powers a function of distance plus noise of readings; distance then explains 59 % of the variance."""
     e = flight.exchanges
     truth = calib.Ranges.from_exchanges(e, poses=flight.poses, tags=flight.tags).truth_m
     shared = -82.0 - 20 * np.log10(truth / 3.5)
@@ -342,7 +342,7 @@ def noisy_powers(flight: Flight, rng: np.random.Generator) -> Flight:
 
 
 def other_anchor(flight: Flight, rng: np.random.Generator, *, plan: Plan, gap: bool) -> Flight | list[Flight]:
-    """Change an anchor's delay by 1.5 ns between two sessions: two recordings, or one with a day between."""
+    """Change the delay of an anchor by 1.5 ns between two sessions, in two recordings or in one with a gap of a day."""
     seed, tag = int(rng.integers(0, 2**31)), 100 + int(rng.integers(0, plan.anchors))
     size = float(rng.choice([-1, 1])) * 1.5 * LIGHT * 1e-9 / 2
     first, second = fly(plan, seed, 1), fly(plan, seed + 1, 1)
@@ -358,7 +358,7 @@ def other_anchor(flight: Flight, rng: np.random.Generator, *, plan: Plan, gap: b
 
 
 def as_read(flight: Flight, rng: np.random.Generator, **columns: Any) -> Flight:
-    """Return a flight that was imported otherwise than it was recorded."""
+    """Return a flight as a wrong import would read it."""
     whole = {
         name: np.full(len(flight.exchanges), value) if name == "protocol" else value for name, value in columns.items()
     }
@@ -366,12 +366,12 @@ def as_read(flight: Flight, rng: np.random.Generator, **columns: Any) -> Flight:
 
 
 def in_ns(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Take nanoseconds for ticks."""
+    """Read nanoseconds as ticks."""
     return changed(flight, **{n: np.rint(getattr(flight.exchanges, n) * 1e9 / TICKS).astype(np.int64) for n in STAMPS})
 
 
 def simulated(flight: Flight, rng: np.random.Generator, *, settings: tuple[str, ...] = ()) -> Any:
-    """Return a flight of the simulator instead, of a minute."""
+    """Return a simulated flight of a minute instead."""
     seed = f"run.seed={rng.integers(0, 2**31)}"
     return simulate(load(SCENARIO, [seed, "run.duration_s=60", *settings]))
 
@@ -382,7 +382,7 @@ def nothing(flight: Flight, rng: np.random.Generator) -> Flight:
 
 
 def names(*words: str) -> frozenset[str]:
-    """Return names of faults."""
+    """Return the names of faults."""
     return frozenset(words)
 
 
@@ -501,28 +501,28 @@ FAULTS: Final = (
 )  # fmt: skip
 
 
-def said(case: Case, seed: int) -> set[str]:
-    """Return what the doctor says of a case."""
+def findings_of(case: Case, seed: int) -> set[str]:
+    """Return the findings of the doctor for a case."""
     rng = np.random.default_rng([seed, 33])
     return {finding.fault for finding in calib.examine(case.plant(fly(case.plan, seed), rng))}
 
 
 def judged(case: Case, seeds: range) -> tuple[int, int, Counter[str]]:
-    """Return hits, runs with a false alarm, and how often each false finding was reported."""
-    found = [said(case, seed) for seed in seeds]
+    """Return the number of detections, the number of runs with a false alarm, and counts of the false findings."""
+    found = [findings_of(case, seed) for seed in seeds]
     wrong = [one - case.expected - case.also for one in found]
     return sum(bool(one & case.expected) for one in found), sum(map(bool, wrong)), Counter(chain.from_iterable(wrong))
 
 
 def table(first: int) -> str:
-    """Return the lines of the page, from cases on all cores."""
+    """Return the lines of the page; cases run on all cores."""
     with ProcessPoolExecutor(2) as pool:
         count = len(CLEAN) + len(FAULTS)
         return lines_of(list(pool.map(_judged_by_number, range(count), [first] * count)))
 
 
 def lines_of(found: list[tuple[int, int, Counter[str]]]) -> str:
-    """Return what was found in all cases, and the table of faults by the findings that they should give."""
+    """Return a summary of all cases, and the table of faults with the findings that they should give."""
     cases = [*CLEAN, *FAULTS]
     clean, faulty = found[: len(CLEAN)], found[len(CLEAN) :]
     runs, planted = CLEAN_SEEDS * len(CLEAN), SEEDS * len(FAULTS)
@@ -550,7 +550,7 @@ def _judged_by_number(number: int, first: int) -> tuple[int, int, Counter[str]]:
 
 
 def main() -> None:
-    """Print the table of tuning seeds, or write that of reported ones into the page."""
+    """Print the table of the tuning seeds, or write that of the reported seeds into the page."""
     if "--tuning" in sys.argv:
         print(table(0))
         return

@@ -1,4 +1,4 @@
-"""What takes long: the recorder killed at 50 random moments, and boards served for ten minutes at full rate."""
+"""Long tests: the recorder is killed at 50 random moments, and boards are served for ten minutes at full rate."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SERVED_S = 600.0
 
 
 def main() -> None:
-    """Run both; exits with status 1 where a promise is broken."""
+    """Run both tests; exit with status 1 if one fails."""
     minutes = float(sys.argv[1]) / 60 if len(sys.argv) > 1 else SERVED_S / 60
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -48,7 +48,7 @@ def recorder(folder: Path, *more: str) -> list[str]:
 
 
 def kills(folder: Path) -> bool:
-    """Kill the recorder; the last bytes in the file must not be older than promised, give or take one exchange."""
+    """Kill the recorder; the age of the last bytes in the file must be at most the promised one plus one exchange."""
     rng = np.random.default_rng(1)
     ages = []
     for _ in range(KILLS):
@@ -64,7 +64,7 @@ def kills(folder: Path) -> bool:
 
 
 def long_serve(folder: Path, pid: int, seconds: float) -> bool:
-    """Range at full rate; memory must stay flat and every range be right, across all wraps of the clocks."""
+    """Range at full rate; memory must stay constant and all ranges correct, over all wraps of the clocks."""
     process = subprocess.Popen(recorder(folder, "--duration", str(seconds)), stdout=subprocess.DEVNULL)
     memory = []
     while process.poll() is None:
@@ -74,7 +74,7 @@ def long_serve(folder: Path, pid: int, seconds: float) -> bool:
     with Recording.open(folder / "f.uwb") as recording:
         e = recording.exchanges()
     ranges = raw_range(e)
-    # Delays planted in the scenario (0.368 ns of d in all), 116 ps of noise a stamp, and nothing else.
+    # The scenario has planted delays (a sum of 0.368 ns) and 116 ps of noise per stamp, and no other errors.
     expected = 3.0 + 0.5 * 0.368e-9 * SPEED_OF_LIGHT
     worst = float(np.abs(ranges - expected).max())
     print(

@@ -1,6 +1,6 @@
-"""Intervals of few ranges over seeds: how far delays are off beside what was promised; a table of accuracy.md.
+"""Intervals from few ranges over seeds: errors of delays against their standard errors; a table of docs/accuracy.md.
 
-`python -m benchmarks.few_ranges` prints it. The worlds are those of `benchmarks.worlds`, ten ranges a second.
+`python -m benchmarks.few_ranges` prints it. The worlds are those of `benchmarks.worlds`, with ten ranges per second.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ LASTING: Final[Mapping[str, Any]] = {"lasts_s": 1.0, "share": (0.0, 0.4)}
 
 
 def main() -> None:
-    """Print a row a world: delays are compared about their mean."""
+    """Print a row per world; delays are compared relative to their mean."""
     print("| ranges | tags | reflections | rms (promised), ps | inside 95 % |\n" + "|---" * 5 + "|")
     for count, tags in ((110, 3), (150, 4), (300, 4), (300, 6)):
         for name, more in (("independent", {}), ("lasting", LASTING)):
@@ -31,7 +31,7 @@ def main() -> None:
 
 
 def _one(recipe: Recipe, seed: int) -> tuple[Any, Any]:
-    """Return errors of delays about their mean, and their printed standard errors, in ns."""
+    """Return errors of delays relative to their mean, and their stated standard errors, in ns."""
     world = make(recipe, seed)
     found = calib.fit(world.ranges, between_m=0.0).calibration
     centre = np.eye(recipe.tags) - 1 / recipe.tags

@@ -1,4 +1,4 @@
-"""Write a section of docs/accuracy.md: simulated recordings beside measured ones (`make fidelity`)."""
+"""Write a section of docs/accuracy.md: simulated recordings compared with measured ones (`make fidelity`)."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def reading_rows(run: Simulated) -> list[Row]:
 
 
 def noise_row() -> Row:
-    """From consecutive ratios dt64/dt53, as it was measured: each has the noise of two receptions."""
+    """Return the noise of consecutive ratios dt64/dt53; each ratio has the noise of two receptions."""
     bench = load_scenario(ROOT / "scenarios" / "two_boards_on_a_bench" / "bench.toml")
     e = simulate(bench).exchanges
     ratio = elapsed(e.rx3, e.rx2) / elapsed(e.tx3, e.tx2)

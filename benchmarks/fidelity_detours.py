@@ -1,4 +1,4 @@
-"""The rows of docs/accuracy.md on responses: what tells a detour, in simulated rooms and in a real flight."""
+"""The rows of docs/accuracy.md on impulse responses: detection of detours, in simulated rooms and in a real flight."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from benchmarks.nlos import DETOUR_M, RESPONSE, RISE, ROOMS, of_real_flight, of_
 
 
 def detour_rows() -> list[Row]:
-    """Return what responses tell of detours: in simulated rooms of the geometric channel, and in the real flight."""
+    """Return how well impulse responses indicate detours: in simulated rooms of the geometric channel, and in a real
+    flight.
+    """
     rooms = [of_room(seed) for seed in ROOMS[:12]]
     late = np.concatenate([one.raw_m - one.truth_m for one in rooms]) > DETOUR_M
     simulated = np.concatenate([one.features for one in rooms])

@@ -1,4 +1,4 @@
-"""Errors of simulated flights beside measured ones, for docs/accuracy.md: by power, by pair, and of a twin."""
+"""Errors of simulated flights compared with measured ones, for docs/accuracy.md: by power, by pair, and of a twin."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ DATA = Path(os.environ.get("UWBCAL_DATA", ROOT.parent / "shared" / "data"))
 MILUV = "cirObstacles_3_random_0"
 TAIL_M = 0.3
 REJECTED = 3.9
-"""What is further off than so many standard deviations is not in the published samples."""
+"""Number of standard deviations; the published samples have no errors beyond it."""
 
 GAP_S = 0.42
 TUNED, PREDICTED = "tuned", "predicted"
 Row = tuple[str, str, str, str]
-"""What, measured, simulated, and how it came about."""
+"""Quantity, measured value, simulated value, and the origin of the latter."""
 
 
 def error_rows(train: Simulated, one: Simulated, two: Simulated) -> list[Row]:
@@ -63,7 +63,7 @@ def error_rows(train: Simulated, one: Simulated, two: Simulated) -> list[Row]:
 
 
 def power_rows(flight: Simulated) -> list[Row]:
-    """Lifted powers, and errors by power once antenna delays are taken out and outliers rejected."""
+    """Return rows on lifted powers, and on errors by power without antenna delays and outliers."""
     lifted, bias = np.loadtxt(DATA / "icra2023_bias_fpp.csv", delimiter=",", skiprows=1).T
     edges = np.quantile(lifted, np.linspace(0, 1, 7))
     error, mine = _without_delays(flight), _lifted(flight)
@@ -76,7 +76,7 @@ def power_rows(flight: Simulated) -> list[Row]:
 
 
 def _by_power(error: Floats, lifted: Floats, edges: Floats) -> list[Floats]:
-    """Cut errors into classes of lifted power, each without its outliers."""
+    """Divide errors into classes of lifted power, without the outliers of each class."""
     parts = [error[(lifted >= low) & (lifted < high)] for low, high in itertools.pairwise(edges)]
     for _ in range(10):
         parts = [part[np.abs(part - part.mean()) < REJECTED * part.std()] for part in parts]
@@ -117,7 +117,7 @@ def _without_delays(flight: Simulated) -> Floats:
 
 
 def dependence_rows(flight: Simulated) -> list[Row]:
-    """How errors of a pair hang together: the real flight beside test1, and test1 as often as a pair can range."""
+    """Return rows on the dependence of errors of a pair in time: real flight, test1, and test1 at a high rate."""
     with tempfile.TemporaryDirectory() as folder:
         import_recording(_unpacked(folder), Path(folder) / "real.uwb", importer="miluv")
         real = load_ranges(Path(folder) / "real.uwb")
@@ -151,7 +151,7 @@ def dependence_rows(flight: Simulated) -> list[Row]:
 
 
 def _every(gap_s: float, time_ns: Ints, pair: Ints) -> Ints:
-    """Return rows of exchanges so that those of a pair are at least so far apart."""
+    """Return rows of exchanges such that those of a pair are at least some seconds apart."""
     chosen: list[int] = []
     last: dict[int, int] = {}
     for row, (time, key) in enumerate(zip(time_ns.tolist(), pair.tolist(), strict=True)):
@@ -162,7 +162,7 @@ def _every(gap_s: float, time_ns: Ints, pair: Ints) -> Ints:
 
 
 def _above(error: Floats, pair: Ints) -> Floats:
-    """Return errors less the medians of their pairs."""
+    """Return errors minus the medians of their pairs."""
     found = error.copy()
     for key in np.unique(pair):
         found[pair == key] -= np.median(found[pair == key])
@@ -170,7 +170,7 @@ def _above(error: Floats, pair: Ints) -> Floats:
 
 
 def lag_one(error: Floats, pair: Ints) -> float:
-    """Return the autocorrelation of errors, cut at a metre, from one range of a pair to its next."""
+    """Return the autocorrelation of successive errors of a pair, limited to one metre."""
     above = below = 0.0
     for key in np.unique(pair):
         mine = error[pair == key]
@@ -180,7 +180,7 @@ def lag_one(error: Floats, pair: Ints) -> float:
 
 
 def trace_db(error: Floats, power_dbm: Floats) -> float:
-    """Return by how much ranges of the tail have less first-path power than the others, in the median."""
+    """Return the median first-path power of reflected ranges relative to that of the others."""
     tail = error - np.median(error) > TAIL_M
     return float(np.median(power_dbm[~tail]) - np.median(power_dbm[tail]))
 

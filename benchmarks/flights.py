@@ -1,10 +1,9 @@
-"""Flights with stamps, poses and lever arms to judge the doctor by, which share nothing with the simulator.
+"""Flights with stamps, poses and lever arms for tests of the doctor, which share no code with the simulator.
 
-Bodies swim on sums of sines and turn; some carry two tags on lever arms, anchors stand. Stamps are those of clocks
-that are some ppm off, counted from the exchange's true times; powers follow distance, antennas that turn and noise; an
-error has a part by power, noise, and the detour of a reflection, which may last.
-
-Seeds below `FIRST_REPORTED` chose the doctor's thresholds; only those from there on are reported.
+Bodies move on sums of sines and turn; some have two tags on lever arms; anchors stand still. Stamps are those of clocks
+with errors of some ppm, computed from the true times of the exchange; powers depend on distance, antennas that turn,
+and noise; errors have a part that depends on power, noise, and the detours of reflections, which may last. Seeds below
+`FIRST_REPORTED` were used to choose the thresholds of the doctor; only later ones are reported.
 """
 
 from __future__ import annotations
@@ -29,7 +28,9 @@ THIRD_S: Final = 1538.7e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What a flight is made of; `share` of reflected ranges that last `lasts_s` on average (0: each on its own)."""
+    """Parameters of a flight; the `share` of ranges is reflected, and a reflection lasts `lasts_s` on average (0: each
+    range is independent).
+    """
 
     bodies: int = 3
     tags_a_body: int = 2
@@ -50,7 +51,7 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """What the doctor takes instead of a recording."""
+    """A flight in the form that the doctor takes in place of a recording."""
 
     exchanges: Exchanges
     poses: Poses
@@ -60,9 +61,9 @@ class Flight:
 
 
 def fly(plan: Plan, seed: int, boards: int | None = None, moved: tuple[int, Floats] | None = None) -> Flight:
-    """Draw a flight; flights of the same `boards` have the same delays and anchors.
+    """Draw a flight; flights with the same `boards` have the same delays and anchors.
 
-    An anchor (its number) that was `moved` by some metres (3,) stands where it is not recorded.
+    An anchor (its number) that was `moved` by some metres (3,) is not at its recorded position.
     """
     rng = np.random.default_rng([seed, 4711])
     own = np.random.default_rng([seed if boards is None else boards, 1174])
@@ -100,7 +101,7 @@ def _tags(plan: Plan) -> list[Tag]:
 
 
 def _pairs(tags: list[Tag], *, among_anchors: bool) -> NDArray[np.int64]:
-    """Every two tags of different bodies, of which one moves unless anchors range with each other."""
+    """Return all pairs of tags of different bodies; one of them moves unless anchors range with each other."""
     return np.array([
         (a.tag, b.tag) for k, a in enumerate(tags) for b in tags[k + 1 :]
         if a.body != b.body and (among_anchors or a.tag < 100 or b.tag < 100)
@@ -108,7 +109,7 @@ def _pairs(tags: list[Tag], *, among_anchors: bool) -> NDArray[np.int64]:
 
 
 class _Tracks:
-    """Where bodies are, and how they are turned."""
+    """Positions and attitudes of bodies."""
 
     def __init__(self, plan: Plan, rng: np.random.Generator, own: np.random.Generator) -> None:
         self.plan = plan
@@ -127,7 +128,7 @@ class _Tracks:
         return np.asarray(self.home[body] + waves.sum(axis=2))
 
     def quaternion(self, body: int, time_s: Floats) -> Floats:
-        """Yaw that swings all around, with a little roll and pitch, as x y z w."""
+        """Return a yaw that oscillates over all directions, with small roll and pitch, as x y z w."""
         a, b, c = self.turn[body]
         yaw, roll, pitch = 3.0 * np.sin(0.4 * a * time_s + a), 0.25 * np.sin(b * time_s), 0.2 * np.sin(c * time_s + 1)
         cy, sy, cr, sr, cp, sp = (f(v / 2) for v in (yaw, roll, pitch) for f in (np.cos, np.sin))
@@ -164,7 +165,7 @@ class _Tracks:
 
 
 def _turned(q: Floats, arm: Floats) -> Floats:
-    """Turn a vector by quaternions (n, 4)."""
+    """Rotate a vector by quaternions (n, 4)."""
     v = q[:, :3]
     across = 2 * np.cross(v, np.broadcast_to(arm, v.shape))
     return np.asarray(arm + q[:, 3:] * across + np.cross(v, across))
@@ -200,7 +201,7 @@ def _exchanges(  # noqa: PLR0913 - all that an exchange is made of
     plan: Plan, rng: Any, time_s: Floats, ends: Any, away: Floats, error: Floats, powers: Floats, delay_ns: Floats,
     skew: Floats,
 ) -> Exchanges:  # fmt: skip
-    """Count stamps: clocks run from noon on, a stamp is its true time by its clock plus its delay."""
+    """Return stamps: a stamp is the true time by its clock, which starts at noon, plus the delay."""
     first, second = ends.T
     flight = away / LIGHT
     longer = 2 * error / LIGHT
@@ -208,7 +209,7 @@ def _exchanges(  # noqa: PLR0913 - all that an exchange is made of
     offset = rng.uniform(0, 60, 200)
 
     def stamp(tag: Any, after_s: Floats, sent: bool, late_s: Floats | float = 0.0) -> Any:
-        # Seconds of the flight and parts of one are counted apart: together they would lose ticks.
+        # Seconds and their fractions are counted separately, because float64 of their sum would lose ticks.
         start = np.rint((time_s + offset[tag]) * TICKS).astype(np.int64)
         slow = np.rint(time_s * skew[tag] * TICKS).astype(np.int64)
         share = 0.44 if sent else -0.56
@@ -245,7 +246,7 @@ def _exchanges(  # noqa: PLR0913 - all that an exchange is made of
 
 
 def _told_by_device(plan: Plan, e: Exchanges) -> Floats:
-    """The device's own arithmetic, from the textbook, cut to four decimals."""
+    """Return the range of the device, by the formula of textbooks, rounded down to four decimals."""
     half, mask = 1 << (plan.bits - 1), (1 << plan.bits) - 1
 
     def less(a: Any, b: Any) -> Floats:

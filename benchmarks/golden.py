@@ -1,10 +1,10 @@
-"""Golden results: what the fits of some thirty flights, worlds and surveys gave, to hold a changed estimator against.
+"""Golden results: fits of about thirty flights, worlds and surveys, to compare with those of a changed estimator.
 
-`python -m benchmarks.golden --write` fits all cases and writes `tests/golden/fits.json`; without it they are fitted
-again and compared with that file (`make golden`). A case is stored as delays and their standard errors in ns, the bias
-curve in metres at `POWERS_DBM`, and the warnings; a refused case as its error. The comparison prints, by case, the
+`python -m benchmarks.golden --write` fits all cases and writes `tests/golden/fits.json`; without `--write` they are
+fitted again and compared with that file (`make golden`). The file has, for each case, delays and their standard errors
+in ns, the bias curve in metres at `POWERS_DBM`, and warnings, or the error. The comparison prints, for each case, the
 largest change of a delay in old standard errors, the smallest and largest ratio of standard errors, the root mean
-square change of the curve, and whether warnings came or went.
+square change of the curve, and changes of the warnings.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ SURVEYS: Final[dict[str, dict[str, Any]]] = {
     "plane, bias over power": PLANE | {"bias_size_m": 0.05, "size_m": 8.0},
 }
 SEED: Final = 10_001
-"""A seed that has chosen no default (see `benchmarks.worlds.FIRST_REPORTED`)."""
+"""A seed that was not used to choose defaults (see `benchmarks.worlds.FIRST_REPORTED`)."""
 
 
 def _simulated(name: str, **settings: Any) -> Any:
@@ -72,7 +72,7 @@ def _from_ranges(poses_until_s: float, fly: Callable[..., Any], *args: Any, **fl
 
 
 def cases() -> dict[str, Callable[[], Any]]:
-    """Return what fits each case, by its name."""
+    """Return functions that fit the cases, by name."""
     of_worlds = {name: recipe for name, recipe in worlds.CLEAN.items() if recipe.seconds <= 240}
     return {
         **{f"scenario {name}": partial(_simulated, name) for name in SCENARIOS},
@@ -91,7 +91,7 @@ def cases() -> dict[str, Callable[[], Any]]:
 
 
 def outcome(name: str) -> dict[str, Any]:
-    """Fit a case and return what is stored of it."""
+    """Fit a case and return its stored values."""
     try:
         found = cases()[name]()
     except calib.CalibError as error:
@@ -109,7 +109,7 @@ def outcome(name: str) -> dict[str, Any]:
 
 
 def compared(old: dict[str, Any], new: dict[str, Any]) -> str:
-    """Return a line on what changed between two outcomes of a case."""
+    """Return a line on the changes between two outcomes of a case."""
     if "error" in old or "error" in new:
         return (
             "refused as before" if old.get("error") == new.get("error") else f"{old.get('error')} -> {new.get('error')}"

@@ -1,7 +1,7 @@
-"""The paper's own samples, held back from the fit: how well the curve and the total uncertainty say what they are.
+"""The published samples of ICRA 2023, partly held back from the fit: errors of the curve, and of the total sigma.
 
 The samples of `icra2023_bias_fpp.csv` have neither pair nor time, and their delays are corrected already. They are
-given to three tags at random, in a random order, so that what is fitted to them is a curve and what errors are made of.
+assigned to three tags at random, in a random order, so that a fit estimates only the curve and the error model.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ Floats = NDArray[np.float64]
 Chosen = NDArray[np.bool_]
 
 PARTS: Final = 5
-"""Ranges of power of equal counts, left out in turn."""
+"""Number of parts of equal counts by power, each held back once."""
 
 DEGREE: Final = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeldBack:
-    """What a fit says of samples that it has not seen: z-scores by the total sigma, and errors beside a plain cubic's.
+    """Results on samples that were held back: z-scores by the total sigma, and errors compared with a cubic polynomial.
 
-    `z_std` should be 1, `inside_95` 0.95; `left_m` is the mean error less what the error model expects, `cubic_left_m`
-    the mean that a plain cubic by least squares leaves.
+    `z_std` should be 1, `inside_95` 0.95; `left_m` is the mean error minus the expectation of the error model,
+    `cubic_left_m` the mean error after a cubic polynomial fitted by least squares.
     """
 
     z_std: float
@@ -50,7 +50,7 @@ def samples(path: Path) -> tuple[Floats, Floats]:
 
 
 def as_ranges(lifted: Floats, bias: Floats, seed: int) -> Ranges:
-    """Give samples to three tags, in a random order, a hundred a second."""
+    """Assign samples to three tags, in a random order, at 100 per second."""
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(lifted))
     pair = np.array([(1, 2), (2, 3), (1, 3)])[rng.integers(0, 3, len(order))]
@@ -67,7 +67,7 @@ def as_ranges(lifted: Floats, bias: Floats, seed: int) -> Ranges:
 
 
 def judged(lifted: Floats, bias: Floats, held: Chosen) -> HeldBack:
-    """Fit what is not `held` back, and judge what is."""
+    """Fit the samples that are not `held` back, and evaluate the others."""
     known = calib.fit(as_ranges(lifted[~held], bias[~held], 1), between_m=0.0).calibration
     others = as_ranges(lifted[held], bias[held], 2)
     applied, overall = known.apply(others), calib.evaluate(others, known).overall
@@ -86,12 +86,12 @@ def judged(lifted: Floats, bias: Floats, held: Chosen) -> HeldBack:
 
 
 def every_second(lifted: Floats) -> Chosen:
-    """Hold every second sample back, of samples in order of power."""
+    """Hold back every second sample, in order of power."""
     return np.asarray(np.arange(len(lifted)) % 2 == 1)
 
 
 def parts(lifted: Floats) -> list[Chosen]:
-    """Hold whole ranges of power back, in turn."""
+    """Hold back each of several parts of the power range."""
     edges = np.quantile(lifted, np.linspace(0, 1, PARTS + 1))
     return [(lifted >= low) & (lifted <= high) for low, high in pairwise(edges)]
 

@@ -1,9 +1,9 @@
-"""Eight hours of recording at 200 exchanges a second, in virtual time: memory, latency and the commands on the file.
+"""Eight hours of recording at 200 exchanges per second, in virtual time: memory, latency and commands on the file.
 
-`python -m benchmarks.hours record HOURS FILE` records from boards that answer at once and cost nothing, so that what is
-measured is the recorder, and adds poses of motion capture; `python -m benchmarks.hours commands FILE` measures show,
-doctor, fit, apply and export on that file, each in a process of its own; `python -m benchmarks.hours write EXCHANGES
-FILE` makes a flight to use instead.
+`python -m benchmarks.hours record HOURS FILE` records from boards that answer at once and need no time, so that only
+the recorder is measured, and adds poses of motion capture. `python -m benchmarks.hours commands FILE` measures show,
+doctor, fit, apply and export on that file, each in a separate process. `python -m benchmarks.hours write EXCHANGES
+FILE` writes a flight for that, without boards.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ from uwblink.wire.messages import REPORTS, GetId, IdReport, RangeCommand, RangeR
 
 RATE_HZ: Final = 200.0
 BEGIN_NS: Final = 1_000_000_000
-"""When flights begin, by their own clock."""
+"""Start of flights by their own clock."""
 
 ANSWER_NS: Final = 4_000_000
 ROUND_S: Final = 100.0
-"""Bodies move so long before they begin again."""
+"""Period after which the motion of bodies repeats."""
 
 A_ROUND: Final = 4_000
-"""Different reports that the boards have, without a wish for more; they come again."""
+"""Number of different reports of the boards; they repeat."""
 
 MANY_A_ROUND: Final = 80_000
-"""So many that a report is of what was 15 ms ago at most, as poses tell it."""
+"""Number of reports such that positions in a report are at most 15 ms older than those of the poses."""
 
 LINES_EVERY_S: Final = 1_800.0
 
@@ -61,16 +61,16 @@ COMMANDS: Final = (
 
 
 class AnsweringPort:
-    """A board that answers every command after `ANSWER_NS` of virtual time."""
+    """A port of a board that answers every command after `ANSWER_NS` of virtual time."""
 
     def __init__(self, ports: AnsweringPorts, name: str) -> None:
-        """Belong to ports."""
+        """Take the ports that it belongs to."""
         self._ports, self.name = ports, name
         self.board = int(name)
         self.due: deque[tuple[int, bytes]] = deque()
 
     def read(self, timeout_s: float) -> bytes:
-        """Return what is due, waiting for it no longer than that."""
+        """Return available bytes, after waiting for at most a time-out."""
         if not self.due or self.due[0][0] > self._ports.time_ns:
             self._ports.wait([self], timeout_s)
         found = b""
@@ -79,7 +79,7 @@ class AnsweringPort:
         return found
 
     def write(self, data: bytes) -> None:
-        """Take a command."""
+        """Accept a command."""
         self.due.append((self._ports.time_ns + ANSWER_NS, self._ports.answer(self.board, data)))
 
     def now_s(self) -> float:
@@ -87,15 +87,15 @@ class AnsweringPort:
         return self._ports.now_s()
 
     def close(self) -> None:
-        """Forget what was not read."""
+        """Discard unread bytes."""
         self.due.clear()
 
 
 class AnsweringPorts:
-    """Ports of such boards; time passes only while somebody waits. Reports are those of a flight, again and again."""
+    """Ports of such boards; virtual time advances only during waits. Reports are those of a flight, repeated."""
 
     def __init__(self, seed: int = 1, a_round: int = A_ROUND) -> None:
-        """Make so many reports for `a_round` of the flight."""
+        """Create the reports of one period (`a_round`) of the flight."""
         self.time_ns = 0
         self.flight = fly(Plan(seconds=ROUND_S, per_second=a_round / ROUND_S), seed)
         e = self.flight.exchanges
@@ -114,14 +114,14 @@ class AnsweringPorts:
         self.names = [str(board) for board in sorted({*e.initiator.tolist(), *e.target.tolist()})]
 
     def answer(self, board: int, data: bytes) -> bytes:
-        """Return what a board says to a command."""
+        """Return the answer of a board to a command."""
         if data == encode(GetId()):
             return encode(IdReport(board))
         times, reports = self._reports[self._key(board, int(data.split(b"|")[1]))]
         return reports[bisect(times, self.time_ns % int(ROUND_S * 1e9)) - 1]
 
     def poses(self, seconds: float) -> Iterator[Poses]:
-        """Yield the poses of so many seconds, a round at a time."""
+        """Yield the poses of some seconds, one period at a time."""
         p = self.flight.poses
         begin, end = BEGIN_NS, BEGIN_NS + int(ROUND_S * 1e9)
         one = p[np.flatnonzero((p.time_ns >= begin) & (p.time_ns < end))]
@@ -138,7 +138,7 @@ class AnsweringPorts:
         return AnsweringPort(self, name)
 
     def wait(self, ports: Sequence[AnsweringPort], timeout_s: float) -> Sequence[AnsweringPort]:
-        """Let time pass until something is due, or the time is over."""
+        """Advance the time until bytes are available, or until the time-out."""
         until = self.time_ns + int(timeout_s * 1e9) + 1
         due = min((port.due[0][0] for port in ports if port.due), default=until)
         self.time_ns = max(self.time_ns, min(due, until))
@@ -153,16 +153,16 @@ class AnsweringPorts:
         return self.time_ns
 
     def moved(self, name: str, _number: str | None) -> str | None:
-        """Return the same name: nobody unplugs these."""
+        """Return the same name, because ports do not change."""
         return name
 
 
 COMMITS: Final[list[tuple[float, float]]] = []
-"""When each commit of the recorder began, and when it ended."""
+"""Start and end of each commit of the recorder."""
 
 
 class TimedWriter(writer.RecordingWriter):
-    """A writer that notes how long its commits took."""
+    """A writer that stores the durations of its commits."""
 
     def _write(self) -> None:
         begin, rows = time.monotonic(), self.waiting
@@ -172,7 +172,7 @@ class TimedWriter(writer.RecordingWriter):
 
 
 def recording(hours: float, path: Path) -> None:
-    """Record in virtual time; prints a line for each half hour of it. *: by processor time."""
+    """Record in virtual time; print a line per half hour. Times are processor times."""
     writer.RecordingWriter = TimedWriter  # type: ignore[misc]
     ports = AnsweringPorts(a_round=MANY_A_ROUND)
     print("| hour | exchanges | file | memory | commit, median (99 %) | message to row, 99 % | times real time* |")
@@ -185,7 +185,7 @@ def recording(hours: float, path: Path) -> None:
 
 
 class _Lines:
-    """Prints what was measured since the last line."""
+    """Prints the measurements since the last line."""
 
     def __init__(self, path: Path) -> None:
         self._next_s = LINES_EVERY_S
@@ -198,7 +198,7 @@ class _Lines:
         commits = np.array(COMMITS)
         COMMITS.clear()
         taken = np.diff(commits, axis=1)[:, 0]
-        # What came right after a batch was taken waits until the next one is committed.
+        # Messages that arrive just after a batch was taken wait until the next batch is committed.
         late = commits[1:, 1] - commits[:-1, 0]
         pages = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
         now = time.process_time()
@@ -213,7 +213,7 @@ class _Lines:
 
 
 def growth(path: Path) -> None:
-    """Print how long commits of a second's messages take, into an empty recording and into one that is there."""
+    """Print the times of commits of one second of messages, into an empty recording and into an existing one."""
     print("| exchanges in the file | commit of a second, median (99 %) |")
     print("|---|---|")
     second = _a_second()
@@ -224,7 +224,7 @@ def growth(path: Path) -> None:
 
 
 def _a_second() -> list[writer.Row]:
-    """Return what a recorder writes in a second: reports and their bytes."""
+    """Return the data that a recorder writes per second: reports and their bytes."""
     ports, decoder = AnsweringPorts(), Decoder(REPORTS)
     rows: list[writer.Row] = []
     for k in range(int(RATE_HZ)):
@@ -247,7 +247,7 @@ def _commits(recording: Recording, rows: list[writer.Row]) -> str:
 
 
 def commands(path: Path) -> None:
-    """Measure each command on a recording, and then commits into it, which leave rows of another time there."""
+    """Measure each command on a recording, and then commits into it, which change the recording."""
     print("| command | processor time | largest memory |")
     print("|---|---|---|")
     for words, seconds, memory_mb in measured(path):
@@ -256,7 +256,7 @@ def commands(path: Path) -> None:
 
 
 def measured(path: Path) -> Iterator[tuple[str, float, float]]:
-    """Yield each command, its processor time, and the most memory that it had."""
+    """Yield each command, its processor time, and its peak memory."""
     with tempfile.TemporaryDirectory() as folder:
         for words in COMMANDS:
             named = [str(path.absolute()) if word == FILE else word for word in words]
@@ -277,7 +277,7 @@ def write(exchanges: int, path: Path) -> None:
 
 
 def main(words: list[str]) -> None:
-    """Do what the first word says."""
+    """Run the action that the first argument names."""
     what, *rest = words
     if what == "record":
         recording(float(rest[0]), Path(rest[1]))

@@ -1,6 +1,6 @@
-"""How long tables and poses take to come in, beside what DuckDB alone takes to parse the table.
+"""Time of importing tables and poses, compared with the time in which DuckDB alone parses the table.
 
-`python -m benchmarks.importing [ROWS]`: processor time and largest memory, each in a process of its own.
+`python -m benchmarks.importing [ROWS]` prints processor time and peak memory, each measured in a separate process.
 """
 
 import subprocess
@@ -51,7 +51,7 @@ print(f"\\n{used.ru_utime + used.ru_stime:7.2f} s {used.ru_maxrss / 1024:7.0f} M
 
 
 def main(rows: int = ROWS) -> int:
-    """Print a line a task."""
+    """Print a line per task."""
     with tempfile.TemporaryDirectory() as folder:
         for name, code, argument in (
             ("", TABLE, rows),

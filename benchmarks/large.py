@@ -1,7 +1,7 @@
-"""Measure a calibration of 3.8 million exchanges: time, peak memory, and that the cost grows no faster than the size.
+"""Measure a calibration of 3.8 million exchanges: time, peak memory, and growth with the number of exchanges.
 
-Each size runs in a process of its own on one core. Exchanges are synthetic ranges with the poses of a flight; loading
-is not counted, true distances are. Times are those of the processor, so that other work on the machine counts little.
+Each size runs in a separate process on one core. Exchanges are synthetic ranges with the poses of a flight; the time
+includes true distances, but not loading. Times are processor times, so that other processes have little effect.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ POSES_HZ = 100
 
 
 def main() -> None:
-    """Print one row a size; with an argument, run that size."""
+    """Print one row per size; with an argument, run that size."""
     if len(sys.argv) > 1:
         print("| " + " | ".join(one_size(int(sys.argv[1]))) + " |", flush=True)
         return
@@ -47,7 +47,7 @@ def one_size(size: int) -> list[str]:
     ends = tags, ranges.initiator, ranges.target, ranges.time_ns
     seconds = [processor_time(partial(distances_m, poses, *ends), runs)]
     del poses
-    # From here on: what is there already are the ranges.
+    # The memory until here is that of the ranges.
     Path("/proc/self/clear_refs").write_text("5")
     seconds += [processor_time(partial(settled, ranges, loss), runs) for loss in (None, "cauchy")]
     unit = [f"{1e3 * s:.0f} ms" if s < 1 else f"{s:.1f} s" for s in seconds]
@@ -55,7 +55,7 @@ def one_size(size: int) -> list[str]:
 
 
 def processor_time(work: Callable[[], object], runs: int) -> float:
-    """Return the median of some runs in seconds, the first of several not counted."""
+    """Return the median time of some runs in seconds; the first of several runs is not counted."""
     times = []
     for _ in range(runs + (runs > 1)):
         start = time.process_time()
@@ -65,7 +65,7 @@ def processor_time(work: Callable[[], object], runs: int) -> float:
 
 
 def settled(ranges: Ranges, loss: str | None) -> None:
-    """Fit ranges, and end where the fit did not settle: its time would say nothing."""
+    """Fit ranges; exit if the fit did not converge, because its time has no meaning."""
     from calib.fitting.fitting import fit
 
     if not fit(ranges, loss=loss).success:
@@ -73,7 +73,7 @@ def settled(ranges: Ranges, loss: str | None) -> None:
 
 
 def peak_mb() -> float:
-    """Return the peak of resident memory since it was last cleared (Linux)."""
+    """Return the peak of resident memory since the last reset (Linux)."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1e3
 

@@ -1,6 +1,6 @@
-"""Which ranges went by a detour, told by features of their receptions: simulated rooms left out, and a real flight.
+"""Detection of reflected ranges by features of their receptions: simulated rooms that were left out, and a real flight.
 
-Run as a script it prints figures of docs/accuracy.md; the tests use the same functions.
+As a script it prints figures of docs/accuracy.md; the tests use the same functions.
 """
 
 from __future__ import annotations
@@ -29,20 +29,21 @@ SHARED = Path(os.environ.get("UWBCAL_DATA", ROOT.parent / "shared" / "data"))
 FLIGHT = "miluv_cirObstacles_3_random_0.tar.xz"
 DETOUR_M = 0.3
 ROOMS = range(300, 324)
-"""Numbers of rooms: others than those with which features were chosen (0 to 23, 200 to 215)."""
+"""Numbers of the rooms, which were not used to choose features (rooms 0 to 23 and 200 to 215 were)."""
 
 BLOCKS = 6
-"""Parts of the real flight, in order of time, of which each is left out once."""
+"""Number of parts of the real flight, in order of time; each is left out once."""
 
 VENDOR_DB = 6.0
-"""Total less first-path power from which a range counts as reflected (APS006, part 3): here the energy of the response,
-of which the chip makes its total power."""
+"""Difference of total and first-path power from which a range is taken for reflected (Decawave APS006, part 3). Here
+the energy of the impulse response is used, from which the chip computes its total power.
+"""
 
 RESPONSE, RISE = FEATURES.index("response_db"), FEATURES.index("rise_taps")
 
 
 def room(seed: int, duration_s: float) -> uwbsim.Scenario:
-    """Return a room of its own: size, materials, things and obstacles are drawn, two robots fly among four anchors."""
+    """Return a random room: size, materials, objects and obstacles are drawn; two robots fly among four anchors."""
     rng = np.random.default_rng([seed, 0xA0C])
     size = np.array([rng.uniform(5, 12), rng.uniform(4, 9), rng.uniform(2.5, 4)])
     walls = {"material": str(rng.choice(["brick", "concrete", "drywall"])), "floor": "concrete"}
@@ -74,14 +75,14 @@ def room(seed: int, duration_s: float) -> uwbsim.Scenario:
 
 
 def of_room(seed: int, duration_s: float = 15.0) -> Ranges:
-    """Return the ranges of a simulated room's robots, with the features of their responses."""
+    """Return the ranges of the robots in a simulated room, with the features of their responses."""
     found = calib.load_ranges(uwbsim.simulate(room(seed, duration_s), contention=False))
     flying = (found.initiator >= 10) | (found.target >= 10)
     return replace(found[flying], source=f"room {seed}", recordings=())
 
 
 def real_flight(folder: Path) -> Contents:
-    """Import the flight of the MILUV dataset from a folder with its archive."""
+    """Import the flight of the MILUV dataset from the archive in a folder."""
     with tempfile.TemporaryDirectory() as scratch:
         with tarfile.open(folder / FLIGHT) as archive:
             archive.extractall(scratch, filter="data")
@@ -96,22 +97,22 @@ def of_real_flight(folder: Path) -> Ranges:
 
 
 def published_error_m(ranges: Ranges, folder: Path) -> Floats:
-    """Return the errors (n,) of ranges corrected by the calibration published for the boards, less their median."""
+    """Return the errors (n,) of ranges corrected by the calibration published for the boards, minus their median."""
     error = read_miluv(folder / "miluv_published_calibration.json").apply(ranges).corrected_m - ranges.truth_m
     return np.asarray(error - np.median(error))
 
 
 def without_features(ranges: Ranges) -> Ranges:
-    """Return ranges of which only powers are known."""
+    """Return ranges with powers but without features."""
     return replace(ranges, features=np.full_like(ranges.features, np.nan))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Told:
-    """What was told of ranges (n,) that were left out: their probability of a reflection, before they were measured.
+    """Predictions for ranges (n,) that were left out: the probability of a reflection, from features and power.
 
-    `afterwards` (n,) is that probability by the same calibration and the error of the range, `long` (n,) whether it is
-    more than `DETOUR_M` too long.
+    `afterwards` (n,) is the probability that also uses the error of the range, `long` (n,) is true for errors above
+    `DETOUR_M`.
     """
 
     probability: Floats
@@ -120,7 +121,7 @@ class Told:
 
     @classmethod
     def left_out(cls, parts: Sequence[Ranges]) -> Told:
-        """Fit all parts but one, and tell of that one; of each in turn. Parts of one source are of one recording."""
+        """Fit all parts but one and predict that one, for each in turn. Parts of one source are of one recording."""
         whole = len({part.source for part in parts}) == 1
         found = []
         for k, part in enumerate(parts):
@@ -133,31 +134,35 @@ class Told:
 
     @property
     def auc(self) -> float:
-        """The area under the curve of hits over false alarms, for ranges that are too long."""
+        """Return the area under the curve of detections over false alarms, for ranges that are too long."""
         return float(roc_auc_score(self.long, self.probability))
 
     @property
     def brier(self) -> float:
-        """The mean square of probability less reflection."""
+        """Return the mean square of probability minus reflection (0 or 1)."""
         return float(
             np.mean(self.afterwards * (1 - self.probability) ** 2 + (1 - self.afterwards) * self.probability**2)
         )
 
     def reliability(self) -> list[tuple[int, float, float]]:
-        """Return number, mean probability and share of reflections of ranges in ten bins of probability."""
+        """Return number, mean probability and share of reflections of the ranges in ten bins of probability."""
         number = np.minimum((10 * self.probability).astype(np.int64), 9)
         bins = [number == k for k in range(10) if np.any(number == k)]
         return [(int(b.sum()), float(self.probability[b].mean()), float(self.afterwards[b].mean())) for b in bins]
 
     @property
     def unreliability(self) -> float:
-        """The mean distance between probability and share of reflections, over the ranges."""
+        """Return the mean absolute difference of probability and share of reflections, weighted by the number of
+        ranges.
+        """
         return sum(count * abs(told - found) for count, told, found in self.reliability()) / len(self.long)
 
 
 def vendor_rule(parts: Sequence[Ranges], as_told: Told) -> Told:
-    """Return the rule by 6 dB as probabilities: of each part the shares of reflections among the flagged ranges of the
-    others, and among theirs that are not."""
+    """Return probabilities by the 6 dB rule of the vendor.
+
+    They are the shares of reflections among flagged and among other ranges, in all parts but the one that is predicted.
+    """
     flagged = np.concatenate([one.features[:, RESPONSE] > VENDOR_DB for one in parts])
     part = np.repeat(np.arange(len(parts)), [len(one) for one in parts])
     probability = np.zeros(len(part))
@@ -168,7 +173,7 @@ def vendor_rule(parts: Sequence[Ranges], as_told: Told) -> Told:
 
 
 def show(name: str, parts: Sequence[Ranges]) -> None:
-    """Print what is told of parts that are left out, by all features, by power alone, and by the vendor's rule."""
+    """Print the results for parts that were left out: with all features, with power alone, with the vendor's rule."""
     told = Told.left_out(parts)
     several = {
         "features": told,

@@ -1,8 +1,9 @@
-"""Draws docs/figures/first_result.svg, the README's picture: ranges of two flights before and after a calibration.
+"""Draw docs/figures/first_result.svg, the figure of the README: range errors of two flights before and after
+calibration.
 
-Left: the first test flight of scenarios/icra2023, calibrated by its training flight; both are simulated anew, so the
-picture is what the README's commands give. Right: the second flight of STAR-loc, calibrated by the first; it needs the
-folder of public data sets (see `benchmarks.scoreboard`) and is left out without one.
+Left: the first test flight of scenarios/icra2023, calibrated with its training flight. Both are simulated, so the
+figure shows the results of the commands in the README. Right: the second flight of STAR-loc, calibrated with the first;
+it needs the folder of public data sets (see `benchmarks.scoreboard`) and is left out without it.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from benchmarks.scoreboard import DATA_SETS, Lab
 from uwblink.arrays import Floats
 
 PICTURE: Final = Path("docs/figures/first_result.svg")
-# Okabe and Ito's colours; the two curves also differ by their dashes.
+# Colours of Okabe and Ito; the two curves also have different dashes.
 STYLES: Final = {"as reported": ("#D55E00", "--"), "corrected": ("#0072B2", "-")}
 SHOWN_CM: Final = (-30.0, 60.0)
 BINS: Final = 24
@@ -30,7 +31,7 @@ FEWEST: Final = 60
 
 
 Errors = tuple[dict[str, Floats], Floats]
-"""Errors (n,) of a flight's ranges in cm before and after, and their mean first-path powers (n,) in dBm."""
+"""Errors (n,) of the ranges of a flight in cm, before and after calibration, and mean first-path powers (n,) in dBm."""
 
 
 def errors_cm(calibration: calib.Calibration, ranges: calib.Ranges) -> Errors:
@@ -47,7 +48,7 @@ def simulated() -> Errors:
 
 
 def recorded(data: Path) -> Errors:
-    """Run STAR-loc's recipe as far as a calibration by the first flight and return the errors of the second."""
+    """Run the recipe of STAR-loc up to the calibration with the first flight, and return the errors of the second."""
     starloc = next(one for one in DATA_SETS if one.name == "STAR-loc")
     with tempfile.TemporaryDirectory() as folder:
         lab = Lab(Path(folder))
@@ -61,7 +62,7 @@ def recorded(data: Path) -> Errors:
 
 
 def draw_shares(axes: Axes, errors: dict[str, Floats]) -> None:
-    """Draw how the errors are distributed."""
+    """Draw the distributions of errors."""
     edges = np.arange(SHOWN_CM[0], SHOWN_CM[1] + 1, 2)
     for name, error in errors.items():
         colour, dashes = STYLES[name]
@@ -86,7 +87,7 @@ def draw_over_power(axes: Axes, errors: dict[str, Floats], power_dbm: Floats) ->
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Simulate, fit, draw."""
+    """Simulate, fit and draw."""
     options = argparse.ArgumentParser(prog="benchmarks.picture", description=f"Draw {PICTURE}.")
     options.add_argument("data", type=Path, nargs="?", help="folder with the archive of STAR-loc")
     data = options.parse_args(arguments).data

@@ -1,4 +1,4 @@
-"""What one would write without the packages: plain scripts, straight from the definitions, to measure against."""
+"""Plain scripts for the same tasks, written from the definitions without the packages, for comparison."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WIDTHS_IN = (7.16, 3.5)
 
 
 def monte_carlo(count: int, seed: int = 1) -> Floats:
-    """Errors of DS-TWR in metres: six noisy stamps, two skewed clocks, 5 m."""
+    """Return errors of DS-TWR in metres: six noisy stamps, two skewed clocks, 5 m."""
     rng = np.random.default_rng(seed)
     flight, reply, third, noise_s = 5 / C, 305e-6, 1538.7e-6, 1e-10
     first, second = 1 + 5e-6, 1 - 5e-6
@@ -33,7 +33,7 @@ def monte_carlo(count: int, seed: int = 1) -> Floats:
 
 
 def five_timeouts(count: int) -> float:
-    """Run exchanges of five time-outs each, one after the other, in bare SimPy; returns when the last has ended."""
+    """Run exchanges with five time-outs each, one after the other, in SimPy; return the end of the last one."""
     import simpy
 
     env = simpy.Environment()
@@ -49,7 +49,7 @@ def five_timeouts(count: int) -> float:
 
 
 def parse(table: Path) -> int:
-    """Read a table with DuckDB alone; returns how many rows it has."""
+    """Read a table with DuckDB alone; return the number of its rows."""
     import duckdb
 
     connection = duckdb.connect()
@@ -59,7 +59,7 @@ def parse(table: Path) -> int:
 
 
 def least_squares(error_m: Floats, initiator: Ints, target: Ints) -> Floats:
-    """Delays in metres by tag from errors of ranges (n,), robustly: scipy on a dense matrix."""
+    """Return delays by tag in metres from errors of ranges (n,), by a robust loss of SciPy with a dense matrix."""
     from scipy import optimize
 
     tags, ends = np.unique(np.concatenate([initiator, target]), return_inverse=True)
@@ -78,7 +78,7 @@ def least_squares(error_m: Floats, initiator: Ints, target: Ints) -> Floats:
 
 
 def draw(panels: list[dict[str, Floats]]) -> int:
-    """Draw clouds of errors over power, and histograms, at a page's and a column's width; returns bytes of SVG."""
+    """Draw errors over power and histograms at the widths of a page and a column; return SVG files."""
     from matplotlib.figure import Figure
 
     total = 0

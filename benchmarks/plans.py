@@ -1,8 +1,8 @@
-"""Plans of flights beside fits of them over seeds: promised and actual errors; a table of docs/accuracy.md.
+"""Plans of flights compared with fits over seeds: predicted and actual errors; a table of docs/accuracy.md.
 
-The worlds are those of `benchmarks.trajectories`, which share nothing with plan or fit. A plan is made of a recording
-of the flight (the first seed; positions and attitudes as they are recorded, ranges are not looked at), and of robots
-that fly about a room of the same size, of which nothing but numbers is known.
+The worlds are those of `benchmarks.trajectories`, which share no code with plans and fits. One plan is made from a
+recording of the flight (the first seed; its recorded positions and attitudes, not its ranges), another for robots that
+fly in a room of the same size, of which only some numbers are known.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ STANDING: Final = {"seconds": 16.0, "still_s": 4.0, "rate_hz": 80.0}
 
 
 def _taped(seed: int) -> Any:
-    """Fly after standing for four seconds, with the distance of tags 1 and 3 by a tape that is off by a centimetre."""
+    """Fly after standing still for four seconds; the distance of tags 1 and 3 is measured with an error of 1 cm."""
     flown = flight(seed=seed, seconds=16.0, standing_s=4.0, **ERRING)
     apart = np.linalg.norm(np.diff(flown.antennas(np.array([1, 3]), np.array([1.0, 1.0])), axis=0))
     off = 0.01 * np.random.default_rng(seed).normal()
@@ -51,14 +51,14 @@ OF_ROBOTS: Final[dict[str, dict[str, Any]]] = {
     "icra2023 test 1, 60 s, known for 10 s": {"seconds": 60.0, "rate_hz": 160.0, "imu": "consumer"},
 }
 FEWER: Final = {"icra2023 test 1, 60 s, known for 10 s": 3, "sines, nothing known": 6}
-"""By how many times fewer seeds of a world are flown: its fits take longer."""
+"""Divisors of the number of seeds for worlds whose fits take longer."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """One fit: errors (tags,) of its delays in ps, and which it claims."""
+    """One fit: errors (tags,) of its delays in ps, and a mask of those that it determines."""
 
     tags: tuple[int, ...]
     error_ps: Floats
@@ -66,7 +66,7 @@ class Fitted:
 
 
 def fitted(name: str, seed: int) -> Fitted:
-    """Fly, fit, and compare with what was planted."""
+    """Fly, fit, and compare with the planted values."""
     world = FLIGHTS[name]
     flown = world.make(seed)
     found = calib.fit_from_ranges(flown, minimum_norm=True, **world.given).calibration
@@ -76,7 +76,7 @@ def fitted(name: str, seed: int) -> Fitted:
 
 
 def promised(name: str) -> tuple[calib.FlightPlan, calib.FlightPlan]:
-    """Return the plan of the flight itself, and that of robots in a room."""
+    """Return the plan for the flight itself, and the plan for robots in a room."""
     world = FLIGHTS[name]
     given = dict(world.given)
     given["anchor_places"] = given.pop("anchors", "given")
@@ -84,7 +84,7 @@ def promised(name: str) -> tuple[calib.FlightPlan, calib.FlightPlan]:
 
 
 def row(name: str, fits: list[Fitted], plans: tuple[calib.FlightPlan, calib.FlightPlan]) -> str:
-    """Return a world's line of the table."""
+    """Return the row of a world."""
     plan, like = plans
     tags = fits[0].tags
     claimed = np.mean([one.claimed for one in fits], axis=0) > 0.5
@@ -101,7 +101,7 @@ def row(name: str, fits: list[Fitted], plans: tuple[calib.FlightPlan, calib.Flig
         f"{1e3 * plan.common_ns / TWO_SIDED:.0f}, {1e3 * like.common_ns / TWO_SIDED:.0f}",
         f"{np.sqrt(np.mean(common**2)):.0f}" if alike else "",
     ]
-    # What stays open is not promised.
+    # Undetermined delays have no predicted error.
     cells[3:] = [f"({cell})" if cell and not says else cell for cell in cells[3:]]
     return f"| {' | '.join(cells)} |"
 

@@ -1,8 +1,8 @@
-"""How long the packages take beside plain scripts (`benchmarks.plain`) that do as much of the same, in turns.
+"""Processor time of the packages divided by that of plain scripts (`benchmarks.plain`) for the same tasks.
 
-`python -m benchmarks.ratios` prints a table, `--check` fails where a ratio is beyond its bound in every one of a dozen
-turns. Processor time of this process, all threads together; sides are measured in turns, so that other work on the
-machine slows both, and the ratio is the median over turns.
+`python -m benchmarks.ratios` prints a table; `--check` fails if a ratio is above its bound in each of a dozen turns.
+Times are processor times of all threads of this process. Both sides are measured in turns, so that other processes slow
+both, and the ratio is the median over turns.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 TRAIN = ROOT / "scenarios" / "icra2023" / "train.toml"
 TURNS: Final = 7
 TRIES: Final = 12
-"""Turns after which a ratio that was never within its bound is taken to be beyond it."""
+"""Number of turns after which a ratio that was always above its bound fails."""
 
 FIGURES: Final = 7
 ROWS: Final = 200_000
@@ -32,7 +32,7 @@ COUNT: Final = 1_000_000
 
 
 class Pair(NamedTuple):
-    """Two ways to the same end: how many times as long ours may take by its goal, and at most before a check fails."""
+    """Two ways to do a task, with the goal for the ratio of their times, and the bound from which a check fails."""
 
     what: str
     beside: str
@@ -43,7 +43,7 @@ class Pair(NamedTuple):
 
 
 def pairs(folder: Path) -> list[Pair]:
-    """Return the pairs, with what they work on made."""
+    """Return the pairs, with their input data."""
     import calib
     import uwblink
     import uwbsim
@@ -77,12 +77,12 @@ def pairs(folder: Path) -> list[Pair]:
         Pair(f"`uwblink import csv` of {ROWS} rows", "DuckDB's `read_csv` of them",
              lambda: uwblink.import_recording(folder / "table.csv", folder / "table.uwb", force=True),
              lambda: plain.parse(folder / "table.csv"), 3.0, 9.0),
-        # 13 to 19 are measured; score tests for direction are a sixth. Corrected steps settle in rooms, and slopes are
-        # evaluated again for the checks, which halves the memory of long recordings.
+        # Measured: 13 to 19. Score tests for direction take a sixth of the time. Corrected steps converge in rooms, and
+        # slopes are computed again for the checks, which halves the memory for long recordings.
         Pair("a fit of the flight: delays, curve, intervals, doubts", "SciPy's `least_squares`, delays alone",
              lambda: fit(ranges), lambda: plain.least_squares(errors, ranges.initiator, ranges.target), None, 18.0),
-        # 4.6 are measured, for five times the rows, of which two thirds are within the curve; 5.6 before both sides of
-        # a difference were one density.
+        # Measured: 4.6, for five times as many rows, two thirds of which are within the curve; 5.6 before both sides of
+        # a difference used one density.
         Pair("a fit of it with all tags listening, four differences of arrival an exchange", "a fit of its exchanges",
              lambda: fit(heard, use="receptions"), lambda: fit(heard), 5.0, 6.0),
         Pair("`calib evaluate --report` of it, in process", "Matplotlib, as many figures at two widths",
@@ -92,25 +92,25 @@ def pairs(folder: Path) -> list[Pair]:
 
 
 def write_table(folder: Path, code: str) -> None:
-    """Write the table that is imported."""
+    """Write the table to import."""
     subprocess.run([sys.executable, "-c", code, str(ROWS)], cwd=folder, check=True)
 
 
 def seconds(work: Callable[[], object]) -> float:
-    """Return the processor time of work, of all threads."""
+    """Return the processor time of a function, of all threads."""
     start = time.process_time()
     work()
     return time.process_time() - start
 
 
 def turn(pair: Pair) -> tuple[float, float]:
-    """Return what both took, ours first."""
+    """Return the times of both sides, that of the packages first."""
     beside = seconds(pair.plain)
     return seconds(pair.ours), beside
 
 
 def table(made: list[Pair]) -> None:
-    """Print a row a pair."""
+    """Print a row per pair."""
     print("| what | beside it | goal | ours | plain | ratio |\n|---|---|---|---|---|---|")
     for pair in made:
         turn(pair)
@@ -122,7 +122,7 @@ def table(made: list[Pair]) -> None:
 
 
 def beyond(pair: Pair) -> str:
-    """Return a line about a ratio that is beyond its bound every time, nothing where it is not."""
+    """Return a line on a ratio that is above its bound in all turns, "" otherwise."""
     found = []
     for _ in range(TRIES):
         ours, beside = turn(pair)
@@ -135,7 +135,7 @@ def beyond(pair: Pair) -> str:
 
 
 def main() -> int:
-    """Print the table; with `--check` return 1, and say why, where a ratio is beyond its bound."""
+    """Print the table; with `--check`, return 1 and print the reason if a ratio is above its bound."""
     with tempfile.TemporaryDirectory() as folder:
         made = pairs(Path(folder))
         if sys.argv[1:] != ["--check"]:

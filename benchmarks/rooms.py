@@ -1,9 +1,9 @@
-"""How far delays are to be trusted where errors depend on places: the table of rooms in docs/accuracy.md.
+"""Errors of delays if errors of ranges depend on positions: the table of rooms in docs/accuracy.md.
 
-Scenarios whose errors all come from one room's geometry, others that have nothing of it, and fields of errors of
-`tests.calib.fitting.fields`, which share no code with the simulator. Seeds are those from `FIRST_REPORTED` on, which
-were not used for tuning. Errors of delays are those about their mean, because a scenario's planted curve and the fitted
-one are zero at different powers.
+The scenarios are some whose errors all follow from the geometry of a room, others without geometry, and fields of
+errors of `tests.calib.fitting.fields`, which share no code with the simulator. Seeds start at `FIRST_REPORTED`; they
+were not used for tuning. Errors of delays are relative to their mean, because the planted and the fitted curve are zero
+at different powers.
 """
 
 from __future__ import annotations
@@ -53,8 +53,9 @@ FIELDS: Final[dict[str, dict[str, Any]]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """Errors of delays about their mean and their standard errors (tags,) in ps, whether places were named, and how
-    much worse a body is localized than with motion capture's calibration."""
+    """Errors of delays relative to their mean and their standard errors (tags,) in ps, whether a finding names places,
+    and the increase of the localization error compared with a calibration by motion capture.
+    """
 
     errors_ps: Floats
     std_ps: Floats
@@ -63,7 +64,7 @@ class Outcome:
 
 
 def outcome_of(result: calib.FitResult, planted_ns: dict[int, float], ratio: float = float("nan")) -> Outcome:
-    """Hold a fit against what was planted."""
+    """Compare a fit with the planted values."""
     found: Any = result.calibration
     tags = list(found.uncertainty.tags)
     centre = np.eye(len(tags)) - 1 / len(tags)
@@ -84,7 +85,7 @@ def with_capture(name: str, seed: int) -> Outcome:
 
 
 def from_ranges(name: str, seed: int) -> Outcome:
-    """Fit a scenario of which bodies are known for the first ten seconds."""
+    """Fit a scenario in which positions are known for the first ten seconds."""
     flown = _flown(name, seed)
     found = calib.fit_from_ranges(flown, minimum_norm=True, poses_until_s=10.0)
     ratio = localized_m(flown, found.calibration) / localized_m(flown, calib.fit(flown).calibration)
@@ -119,9 +120,9 @@ HEAD: Final = (
 
 
 def row(name: str, outcomes: list[Outcome]) -> str:
-    """Return a world's line of the table."""
+    """Return the row of a world."""
     errors, std = (np.concatenate([getattr(one, what) for one in outcomes]) for what in ("errors_ps", "std_ps"))
-    # One flight whose robots hardly see each other would be all of a mean.
+    # Medians, because a single flight with few ranges between robots would dominate a mean.
     each, promised = (
         np.median([np.sqrt(np.mean(getattr(one, what) ** 2)) for one in outcomes]) for what in ("errors_ps", "std_ps")
     )
@@ -139,7 +140,7 @@ def row(name: str, outcomes: list[Outcome]) -> str:
 
 
 def rows(kind: str, seeds: int, pool: Executor) -> list[str]:
-    """Return the lines of a kind of worlds, as they come."""
+    """Yield the rows of a kind of worlds."""
     fly, names, more = KINDS[kind]
     found = []
     for name in names:

@@ -1,10 +1,9 @@
-"""Writes docs/real-data.md: public data sets, calibrated and judged by the commands that docs/importing.md names.
+"""Write docs/real-data.md: public data sets, calibrated and evaluated with the commands of docs/importing.md.
 
-`python -m benchmarks.scoreboard FOLDER` looks in the folder for the archives named in `DATA_SETS`. The commands of a
-data set are its recipe on the page and what is run, with A and B replaced by the names of two flights, each way round.
-Rows of the table come from `calib evaluate`, `calib localize` and `calib fit --hold-out`; the authors' calibrations
-that are columns or curves of a data set are applied here. Exit status: 0 every data set was run, 1 some are not in the
-folder, 2 none is.
+`python -m benchmarks.scoreboard FOLDER` uses the archives in the folder that `DATA_SETS` names. The commands of a data
+set are shown on the page and run, with A and B replaced by the names of two flights, in both orders. Rows of the table
+are from `calib evaluate`, `calib localize` and `calib fit --hold-out`; calibrations of the authors that are columns or
+curves of a data set are applied here. Exit status: 0 every data set was run, 1 some are not in the folder, 2 none is.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ ROOT: Final = Path(__file__).parents[1]
 PAGE: Final = ROOT / "docs" / "real-data.md"
 POSE: Final = ("x", "y", "z", "rot_x", "rot_y", "rot_z", "w")
 EVERY: Final = 50
-"""One of so many rows of a flight is kept in the recording of few ranges: about 150, ten a pair."""
+"""Number of rows of a flight per row in the recording with few ranges: about 150 ranges, ten per pair."""
 
 HEAD: Final = """\
 # Real data
@@ -53,11 +52,11 @@ RECIPES: Final = "\n## Recipes\n\nA and B are flights; every command is also run
 
 @dataclass(frozen=True, slots=True)
 class DataSet:
-    """Public recordings: where they come from, the archive in the folder, and the commands that judge them.
+    """Public recordings: their source, the archive in the folder, and the commands that evaluate them.
 
     `prepare` fills a folder with the files that the commands read and returns the names of the flights. `authors`
-    returns errors in metres (n,) of a flight by the authors' own calibration, and their standard deviations (n,).
-    Errors of raw ranges are not stated where true distances are `made_up`.
+    returns the errors in metres (n,) of a flight with the calibration of the authors, and their standard deviations
+    (n,). Errors of raw ranges are not stated if true distances are `made_up`.
     """
 
     name: str
@@ -72,7 +71,7 @@ class DataSet:
 
 @dataclass(slots=True)
 class Row:
-    """One line of the table: metres, shares from 0 to 1, None where there is no such figure."""
+    """One line of the table, in metres and shares of 1; None for values that do not exist."""
 
     ranges: str
     calibration: str
@@ -92,14 +91,14 @@ class Row:
 
 @dataclass(slots=True)
 class Lab:
-    """A folder in which commands are run once each, and what they said."""
+    """A folder in which each command is run once, with its results and notes: findings, warnings and errors."""
 
     folder: Path
     answers: dict[str, Any] = field(default_factory=dict)
-    said: dict[str, list[str]] = field(default_factory=dict)
+    notes: dict[str, list[str]] = field(default_factory=dict)
 
     def run(self, command: str) -> Any:
-        """Run a command and return its JSON, or None if it prints none or refuses."""
+        """Run a command and return its JSON, or None if it prints none or fails."""
         if command not in self.answers:
             words = shlex.split(command)
             prints_json = words[1] in ("evaluate", "localize", "doctor") or "--hold-out" in words
@@ -110,7 +109,7 @@ class Lab:
         return self.answers[command]
 
     def keep(self, words: list[str], answer: Any, printed: str) -> None:
-        """Keep first clauses of findings, warnings and errors; those about a calibration are kept when it is fitted."""
+        """Store first clauses of findings, warnings and errors; those on a calibration are stored when it is fitted."""
         notes = []
         if words[1] == "doctor" and answer:
             notes = [f"{one['fault']} ({first_clause(one['evidence'])})" for one in answer["findings"]]
@@ -121,11 +120,11 @@ class Lab:
                 if line.startswith(("warning: ", "error: "))
             ]
         if notes:
-            self.said[" ".join(words)] = notes
+            self.notes[" ".join(words)] = notes
 
 
 def first_clause(text: str) -> str:
-    """Return a text up to a colon or semicolon after what names the thing and the fault, which takes 31 characters."""
+    """Return a text up to a colon or semicolon after the first 31 characters, which name the object and the fault."""
     found = re.match(r".{31,}?(?<!\.uwb)(?=[:;] |$)", text)
     return found[0] if found else text
 
@@ -150,7 +149,7 @@ def numbers(columns: dict[str, list[str]], *names: str) -> Floats:
 
 
 def prepare_starloc(archive: Path, folder: Path) -> list[str]:
-    """Write each flight's ranges, every fiftieth of them, and poses of the rig, and where tags and anchors are."""
+    """Write the ranges of each flight, every fiftieth of them, poses of the rig, and positions of tags and anchors."""
     files = {path.name: path for path in unpack(archive, folder)}
     flights = sorted((folder / "data").glob("*/uwb.csv"))
     lever_arms, radios, columns = {}, {}, {}
@@ -168,7 +167,7 @@ def prepare_starloc(archive: Path, folder: Path) -> list[str]:
     arms = turned.inv().apply(antenna - numbers(columns, "x", "y", "z"))
     for tag in np.unique(initiator):
         lever_arms[int(tag)] = np.median(arms[initiator == tag], axis=0)
-    # Markers have numbers of their own: a radio is at the marker that explains its true distances.
+    # Markers have their own numbers: a radio is at the marker that explains its true distances.
     markers = numbers(table(files["uwb_markers_v1.csv"]), "x", "y", "z")
     off = np.linalg.norm(antenna[:, None] - markers, axis=2) - numbers(columns, "gt_range")
     target = numbers(columns, "to_id")[:, 0]
@@ -188,7 +187,7 @@ def starloc_authors(folder: Path, flight: str) -> tuple[Floats, Floats]:
 
 
 def prepare_miluv(archive: Path, folder: Path) -> list[str]:
-    """Unpack every flight beside the archive, and put the published calibration there."""
+    """Unpack all flights in the archive, and copy the published calibration."""
     for each in sorted(archive.parent.glob("miluv_*.tar.xz")):
         unpack(each, folder)
     published = archive.parent / "miluv_published_calibration.json"
@@ -198,7 +197,7 @@ def prepare_miluv(archive: Path, folder: Path) -> list[str]:
 
 
 def prepare_paper(archive: Path, folder: Path) -> list[str]:
-    """Write every second sample as a table of ranges of 10 m, and the others as another."""
+    """Write every second sample as a table of ranges of 10 m, and the other samples as another table."""
     samples = np.loadtxt(archive, delimiter=",", skiprows=1)
     for number in (0, 1):
         lifted, bias = samples[number::2].T
@@ -212,7 +211,7 @@ def prepare_paper(archive: Path, folder: Path) -> list[str]:
 
 
 def paper_authors(folder: Path, _: str) -> tuple[Floats, Floats]:
-    """Return the errors of samples by the published curve of bias, and the published standard deviations."""
+    """Return the errors of samples with the published bias curve, and the published standard deviations."""
     lifted, bias = np.loadtxt(folder / "samples.csv", delimiter=",", skiprows=1)[1::2].T
     published = json.loads((folder / "icra2023_published_fits.json").read_text(encoding="utf-8"))["2022-08_paper"]
     found = []
@@ -224,14 +223,14 @@ def paper_authors(folder: Path, _: str) -> tuple[Floats, Floats]:
 
 
 def prepare_hanyang(archive: Path, folder: Path) -> list[str]:
-    """Put the table and its map there."""
+    """Copy the table and its column map."""
     (folder / "outdoor.csv").write_bytes(gzip.decompress(archive.read_bytes()))
     shutil.copy(ROOT / "docs" / "maps" / "hanyang.toml", folder)
     return ["outdoor"]
 
 
 def prepare_swarm(archive: Path, folder: Path) -> list[str]:
-    """Put the logs there, and places of seven boards on a grid of a metre, where nobody says that they stood."""
+    """Copy the logs, and write invented positions of seven boards, on a grid of a metre; the true ones are unknown."""
     for path in unpack(archive, folder):
         shutil.copy(path, folder)
     places = (f"[[anchors]]\nid = {k + 1}\nposition_m = [{k % 2}, {k // 2}, 1.0]\n" for k in range(7))
@@ -346,7 +345,7 @@ def with_names(text: str, one: str, other: str) -> str:
 
 
 def expanded(commands: str, flights: list[str]) -> list[str]:
-    """Return the commands that need one flight, with every flight, then those that need two, each way round."""
+    """Return the commands with one flight, for every flight, then those with two flights, in both orders."""
     single = [line for line in commands.splitlines() if not re.search(r"\bB\b", line)]
     both = [line for line in commands.splitlines() if line not in single]
     found = [with_names(line, flight, "") for flight in flights for line in single]
@@ -354,7 +353,7 @@ def expanded(commands: str, flights: list[str]) -> list[str]:
 
 
 def figures(lab: Lab, data: DataSet, flights: list[str]) -> list[Row]:
-    """Run a data set's commands and return what they measured, flight by flight."""
+    """Run the commands of a data set and return the results by flight."""
     pairs = [*itertools.permutations(flights, 2)] or [(flights[0], "")]
     labels = {
         with_names(file, *two): with_names(name, *two) for two in pairs for file, name in data.calibrations.items()
@@ -378,14 +377,14 @@ def figures(lab: Lab, data: DataSet, flights: list[str]) -> list[Row]:
         else:
             overall = answer["overall"]
             there = rows.setdefault(flight, before(flight, overall["raw"], lab, data))
-            # A calibration without reflections states its intervals by sigma alone.
+            # A calibration without reflections states intervals by its sigma alone.
             inside = overall["coverage"]["95"] if overall["inside_95"] is None else overall["inside_95"]
             there[file] = row_of(flight, labels[file] + pattern_size(lab.folder / file), overall["full"], inside)
     return [row for there in rows.values() for row in there.values()]
 
 
 def pattern_size(calibration: Path) -> str:
-    """Return how large a calibration's pattern over direction is, "" if it has none."""
+    """Return the size of the pattern over direction of a calibration, "" without one."""
     found = json.loads(calibration.read_text(encoding="utf-8")).get("patterns", [])
     return "".join(f" of {100 * one['rms_m']:.1f} cm" for one in found)
 
@@ -396,7 +395,7 @@ def row_of(flight: str, calibration: str, found: dict[str, Any], inside: float |
 
 
 def before(flight: str, raw: dict[str, Any], lab: Lab, data: DataSet) -> dict[str, Row]:
-    """Return a flight's rows of raw ranges and of the authors' calibration, where the data set contains it."""
+    """Return the rows of a flight for raw ranges and for the calibration of the authors, if the data set contains it."""
     rows = {"none": row_of(flight, "none", raw)}
     if data.authors:
         error, deviation = data.authors(lab.folder, flight)
@@ -408,7 +407,7 @@ def before(flight: str, raw: dict[str, Any], lab: Lab, data: DataSet) -> dict[st
 
 
 FITS: Final = {"--use receptions": "with receptions", "--constants pair": "by pair", "--pattern": "with a pattern"}
-"""What is said of a fit whose command has such options."""
+"""Name of a fit in the table, by the options of its command."""
 
 
 def held_out(name: str, held: dict[str, Any], calibration: str) -> dict[str, Row]:
@@ -420,27 +419,29 @@ def held_out(name: str, held: dict[str, Any], calibration: str) -> dict[str, Row
     }
 
 
-def doubts(said: dict[str, list[str]], flights: list[str]) -> list[str]:
-    """Return a line per command that said something that no other had said, but for the flight's name; of warnings also
-    but for sizes."""
+def notes_by_command(notes: dict[str, list[str]], flights: list[str]) -> list[str]:
+    """Return a line per command with notes that no earlier command had.
+
+    Notes that differ only in the name of the flight are equal, and warnings also if only numbers differ.
+    """
     seen: set[str] = set()
     lines = []
-    for command, notes in said.items():
-        sizes = [r"[0-9.]+ (%|cm|ps)"] * (not any(note.startswith("error: ") for note in notes))
-        alike = [re.sub("|".join([*sizes, *flights]), "", note) for note in notes]
-        new = [note for note, key in zip(notes, alike, strict=True) if key not in seen]
+    for command, own in notes.items():
+        sizes = [r"[0-9.]+ (%|cm|ps)"] * (not any(note.startswith("error: ") for note in own))
+        alike = [re.sub("|".join([*sizes, *flights]), "", note) for note in own]
+        new = [note for note, key in zip(own, alike, strict=True) if key not in seen]
         seen.update(alike)
         lines += [f"- `{re.sub(' -o [^ ]+', '', command)}`: {'; '.join(new)}"] if new else []
     return lines
 
 
 def judge(data: DataSet, archives: Path, work: Path) -> tuple[list[str], list[str]]:
-    """Return a data set's lines of the table and what was refused or doubted."""
+    """Return the lines of a data set in the table, and the notes of its commands."""
     lab = Lab(work / data.name)
     lab.folder.mkdir()
     flights = data.prepare(archives / data.archive, lab.folder)
     lines = [str(row) for row in figures(lab, data, flights)]
-    return lines, doubts(lab.said, flights)
+    return lines, notes_by_command(lab.notes, flights)
 
 
 def write(folder: Path, page: Path, work: Path) -> int:

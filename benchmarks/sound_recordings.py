@@ -1,9 +1,9 @@
-"""False alarms: what the checks of a recording and of its fit say of sound recordings of several worlds.
+"""False alarms: findings of the checks of recordings and of fits in sound recordings of several worlds.
 
-`python -m benchmarks.sound_recordings --seeds 25` (`make sound`) simulates and draws recordings with nothing wrong,
-runs `calib.examine` and `calib.fit`, and prints how many have any finding or warning, and which. Seeds begin where no
-threshold has been chosen. `--planted` runs the plantings of `benchmarks.doctor` instead and prints by fault how many
-were found, and how many causes were named right.
+`python -m benchmarks.sound_recordings --seeds 25` (`make sound`) simulates and draws recordings without faults, runs
+`calib.examine` and `calib.fit`, and prints how many have any finding or warning, and which. Seeds start where no
+threshold was chosen. `--planted` runs the plantings of `benchmarks.doctor` instead, and prints by fault how many were
+found, and how many causes were named correctly.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from benchmarks import doctor
 from benchmarks.flights import Plan, fly
 
 FIRST_SEED: Final = 101_000
-"""Seeds from here on were not used for tuning, here or in `benchmarks.doctor`."""
+"""Seeds from here on were not used for tuning, here and in `benchmarks.doctor`."""
 
 MINUTE: Final = Plan(seconds=60)
 
@@ -46,7 +46,7 @@ SCENARIOS: Final = {
     "tdoa": (12, 60),
     "three_quadcopters": (12, 60),
 }
-"""Shipped scenarios without a fault, and the seconds of their short and long recordings."""
+"""Shipped scenarios without a fault, and the durations of their short and long recordings in seconds."""
 
 WORLDS: Final[dict[str, Callable[[int], Any]]] = {
     **{f"{name}, {s} s": partial(_simulated, name, float(s)) for name, several in SCENARIOS.items() for s in several},
@@ -57,10 +57,10 @@ WORLDS: Final[dict[str, Callable[[int], Any]]] = {
     "flight among four anchors": partial(_flown, replace(MINUTE, anchors=4, tags_a_body=1)),
     "single-sided flight, corrected": partial(_flown, replace(MINUTE, protocol="ss-cfo")),
 }
-"""Worlds without a fault: some of the simulator, four of a generator that shares nothing with it."""
+"""Worlds without a fault: some of the simulator, and four of a generator that shares no code with it."""
 
 SETTINGS: Final[dict[str, dict[str, Any]]] = {"tdoa": {"delays_only": True}, "receptions": {"use": "receptions"}}
-"""Settings of fits by words in the names of worlds: anchors that stand still do not show a curve."""
+"""Settings of fits by words in the names of worlds: anchors that stand still do not determine a curve."""
 
 TRUE_OF: Final = {
     "room/room": {
@@ -72,16 +72,17 @@ TRUE_OF: Final = {
     "tdoa": {"static data"},
     "three_quadcopters": {"power confounded with distance"},
 }
-"""Findings that are true of a world: in the room a metal cabinet stands between tag 1 and the third quadcopter, so that
-half of their ranges are 0.2 to 1.5 m too long, and ranges of other pairs are reflected for seconds. Power of the
-quadcopters follows the distance by 93 to 95 % in one recording of six."""
+"""Findings that are true in a world. In the room, a metal cabinet stands between tag 1 and the third quadcopter, so
+that half of their ranges are 0.2 to 1.5 m too long, and ranges of other pairs are reflected for seconds. The power of
+the quadcopters depends on distance by 93 to 95 % in one recording of six.
+"""
 
 STATED: Final = ("only ", "delays only", "errors last", "power and distance are confounded")
-"""How warnings begin that state what data cannot tell, and doubt nothing: not counted."""
+"""Start of warnings that state only what the data do not determine; these are not counted."""
 
 
-def said_of_sound(job: tuple[str, int]) -> tuple[str, int, list[str], list[str]]:
-    """Return a world and seed with the faults that `examine` finds and that are not true, and warnings of a fit."""
+def check_sound(job: tuple[str, int]) -> tuple[str, int, list[str], list[str]]:
+    """Return world and seed with the false findings of `examine` and the warnings of a fit."""
     name, seed = job
     data, given = WORLDS[name](seed), [own for word, own in SETTINGS.items() if word in name]
     try:
@@ -92,11 +93,11 @@ def said_of_sound(job: tuple[str, int]) -> tuple[str, int, list[str], list[str]]
     return name, seed, [fault for fault in found if fault not in TRUE_OF.get(name.split(",")[0], ())], warnings
 
 
-def said_of_planted(job: tuple[int, int]) -> tuple[str, int, bool, list[str]]:
-    """Return a planted fault and seed, whether it was found, and what else was said that is not true."""
+def check_planted(job: tuple[int, int]) -> tuple[str, int, bool, list[str]]:
+    """Return fault and seed, whether it was found, and other findings that are false."""
     number, seed = job
     case = doctor.FAULTS[number]
-    found = doctor.said(case, seed)
+    found = doctor.findings_of(case, seed)
     return case.name, seed, bool(found & case.expected), sorted(found - case.expected - case.also)
 
 
@@ -106,7 +107,7 @@ def sound(seeds: int, workers: int) -> str:
     alarms, kinds, start = Counter[str](), Counter[str](), time.monotonic()
     fits, any_of = Counter[str](), 0
     with ProcessPoolExecutor(workers) as pool:
-        for done, (name, seed, faults, warnings) in enumerate(pool.map(said_of_sound, jobs), 1):
+        for done, (name, seed, faults, warnings) in enumerate(pool.map(check_sound, jobs), 1):
             alarms[name] += bool(faults)
             fits[name] += bool(warnings)
             any_of += bool(faults or warnings)
@@ -127,11 +128,11 @@ def sound(seeds: int, workers: int) -> str:
 
 
 def planted(seeds: int, workers: int) -> str:
-    """Return a summary of planted faults: found, and named right (found, and nothing else that is not true)."""
+    """Return a summary of planted faults: found, and named correctly (found, and no false finding)."""
     jobs = [(number, FIRST_SEED + k) for k in range(seeds) for number in range(len(doctor.FAULTS))]
     found, right = Counter[str](), Counter[str]()
     with ProcessPoolExecutor(workers) as pool:
-        for name, seed, hit, wrong in pool.map(said_of_planted, jobs):
+        for name, seed, hit, wrong in pool.map(check_planted, jobs):
             found[name] += hit
             right[name] += hit and not wrong
             if wrong or not hit:

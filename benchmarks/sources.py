@@ -1,7 +1,7 @@
-"""Plain byte sources behind pseudo-terminals, to measure driver and recorder without a simulator.
+"""Byte sources behind pseudo-terminals, to measure driver and recorder without a simulator.
 
-Run as a script: `python -m benchmarks.sources PORTS RATE SECONDS BURST` prints the names of its ports, waits until
-each was asked for its id, then sends numbered reports and prints how many.
+As a script, `python -m benchmarks.sources PORTS RATE SECONDS BURST` prints the names of its ports, waits until each was
+asked for its id, then sends numbered reports and prints their number.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def report(number: int) -> bytes:
 
 
 def answer(terminals: list[Terminal], seconds: float) -> set[int]:
-    """Answer requests for ids; returns who asked."""
+    """Answer requests for ids; return the ports that asked."""
     asked, until = set(), time.monotonic() + seconds
     while time.monotonic() < until:
         for k, terminal in enumerate(terminals):
@@ -44,7 +44,7 @@ def main() -> None:
     while sent < rate * seconds:
         data = b"".join(report(sent + k) for k in range(burst))
         for terminal in terminals:
-            # In bursts the bytes come as USB brings them, in pieces of 64.
+            # In bursts, bytes are sent in pieces of 64, as by USB.
             for at in range(0, len(data), PIECE if burst > 1 else len(data)):
                 terminal.write(data[at : at + (PIECE if burst > 1 else len(data))])
         sent += burst

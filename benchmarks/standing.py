@@ -1,7 +1,7 @@
-"""Boards that stand still, in arrangements: ranges made by code that shares nothing with calibration or simulator.
+"""Boards that stand still in arrangements: ranges by code that shares nothing with calibration and simulator.
 
-A pair has a constant error in an arrangement, a range its noise, some pairs a reflection that lengthens them; boards
-have delays, and where asked for a bias over received power, which falls with distance.
+A pair has a constant error in an arrangement, a range has noise, and some pairs have a reflection that lengthens their
+ranges. Boards have delays, and optionally a bias over received power, which decreases with distance.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ DIMENSIONS = {"line": 1, "plane": 2, "space": 3}
 
 @dataclass(frozen=True, kw_only=True)
 class Standing:
-    """What is planted: delays in ns by tag, places (arrangements, tags, 3), and the ranges that follow."""
+    """Planted values: delays in ns by tag, positions (arrangements, tags, 3), and the ranges."""
 
     delays_ns: dict[int, float]
     places: list[Floats]
@@ -32,7 +32,7 @@ class Standing:
 
 
 def places_of(rng: np.random.Generator, boards: int, dimensions: int, size_m: float, apart_m: float) -> Floats:
-    """Return random places (boards, 3), none nearer to another than `apart_m`."""
+    """Return random positions (boards, 3), at least `apart_m` from each other."""
     while True:
         place = np.zeros((boards, 3))
         place[:, :dimensions] = rng.uniform(0, size_m, (boards, dimensions))
@@ -42,17 +42,17 @@ def places_of(rng: np.random.Generator, boards: int, dimensions: int, size_m: fl
 
 
 def power_dbm(length_m: float) -> float:
-    """Return the received power at a distance, that of free space."""
+    """Return the received power at a distance in free space."""
     return -77.0 - 20.0 * math.log10(max(length_m, 0.1))
 
 
 def bias_m(power: float, size_m: float) -> float:
-    """Return a bias that turns from negative to positive as power falls, zero at -82 dBm."""
+    """Return a bias that changes from negative to positive as power decreases, zero at -82 dBm."""
     return size_m * float(np.tanh((-82.0 - power) / 8.0))
 
 
 def wave_m(power: Floats | float, size_m: float) -> Floats:
-    """Return a bias that is not monotone: one period of a sine over lifted power up to 1.7, zero at -82 dBm."""
+    """Return a bias that is not monotonic: one period of a sine over lifted power up to 1.7, zero at -82 dBm."""
     lifted = np.minimum(10 ** ((np.append(power, -82.0) + 82.0) / 10), 1.7)
     found = size_m * np.sin(2 * np.pi * lifted / 1.7)
     return np.asarray(found[:-1] - found[-1])
@@ -80,8 +80,8 @@ def standing_boards(  # noqa: PLR0913 - a world has many settings
 ) -> Standing:
     """Return ranges of boards in random arrangements on a "line", in a "plane" or in "space".
 
-    `each` ranges a pair and arrangement; `reflected` is the share of pairs whose way is longer in one, by `detour_m`.
-    `board_power_db` is the spread of the boards' own powers.
+    There are `each` ranges per pair and arrangement. `reflected` is the share of pairs whose ranges are longer by
+    `detour_m` in an arrangement. `board_power_db` is the standard deviation of the powers of boards.
     """
     rng = np.random.default_rng([seed, boards, arrangements])
     delays = dict(zip(range(1, boards + 1), rng.normal(-0.05, 0.2, boards).tolist(), strict=True))

@@ -1,6 +1,6 @@
-"""How late streamed ranges are: from the report's bytes at the port to a datagram in another process, in ms.
+"""Latency of streamed ranges: from the bytes of the report at the port to a datagram in another process, in ms.
 
-Served boards on this machine, so printing and USB are not in it: `python -m benchmarks.streaming`.
+`python -m benchmarks.streaming` uses served boards on this computer, so the latency excludes the board and USB.
 """
 
 import socket
@@ -19,7 +19,7 @@ COUNT = 1000
 
 
 def main() -> int:
-    """Print the median and the 99th percentile of the delays."""
+    """Print the median and the 99th percentile of the latencies."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear, served() as server:
         ear.bind(("127.0.0.1", 0))
         arrived: list[int] = []

@@ -1,7 +1,7 @@
-"""Surveys of boards that stand still, over many seeds: errors of delays beside what was promised, and coverage.
+"""Surveys of boards that stand still, over many seeds: errors of delays, their standard errors, and coverage.
 
-`python -m benchmarks.surveys --write` writes the table of docs/accuracy.md (`make surveys`). With
-`--results FILE` outcomes are kept, a line each, and what stands there is not surveyed again.
+`python -m benchmarks.surveys --write` writes the table of docs/accuracy.md (`make surveys`). With `--results FILE`,
+results are stored, one per line, and stored ones are not computed again.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ HEAD = """\
 |---|---|---|---|---|---|"""
 
 LABELS: dict[str, dict[str, Any]] = {
-    f"line, {share} % reflected, labels exchanged": LINE | {"reflected": share / 100, "said": "wrongly"}
+    f"line, {share} % reflected, labels exchanged": LINE | {"reflected": share / 100, "order": "wrong"}
     for share in (0, 5, 10)
 }
 LABELS_HEAD = """\
@@ -67,7 +67,7 @@ LABELS_HEAD = """\
 
 @dataclass(frozen=True)
 class Outcome:
-    """One survey: errors of delays and their standard deviations in ns, tag by tag, or why there are none."""
+    """One survey: errors of delays and their standard deviations in ns by tag, or its error."""
 
     tags: tuple[int, ...] = ()
     errors_ns: tuple[float, ...] = ()
@@ -77,12 +77,12 @@ class Outcome:
 
 
 def one(name: str, seed: int) -> Outcome:
-    """Survey one world; in those of `LABELS`, two boards are exchanged in the order that is said of an arrangement."""
+    """Survey one world; in the worlds of `LABELS`, the order given for an arrangement has two boards exchanged."""
     settings = dict((WORLDS | LABELS)[name])
-    said = settings.pop("said", None)
+    order = settings.pop("order", None)
     world = standing_boards(seed, **settings)
     shape = "" if settings["shape"] == "space" else settings["shape"]
-    orders, two = orders_of(world, seed if said else None) if said is not None else ({}, "")
+    orders, two = orders_of(world, seed if order else None) if order is not None else ({}, "")
     try:
         found = calib.survey(world.ranges, known=calib.Knowledge(shape=shape, orders=orders)).calibration
     except calib.UnanswerableError as error:
@@ -96,7 +96,9 @@ def one(name: str, seed: int) -> Outcome:
 
 
 def orders_of(world: Standing, wrong: int | None) -> tuple[dict[str, tuple[int, ...]], str]:
-    """Return the boards' orders by arrangement; with a seed for it, two exchanged in one, and which as it is said."""
+    """Return the orders of boards by arrangement. With a seed, two boards are exchanged in one order, and a text names
+    them.
+    """
     orders = {str(k): (np.argsort(place[:, 0]) + 1).tolist() for k, place in enumerate(world.places, start=1)}
     text = ""
     if wrong is not None:
@@ -109,17 +111,18 @@ def orders_of(world: Standing, wrong: int | None) -> tuple[dict[str, tuple[int, 
 
 
 def planned(places: Iterable[Floats]) -> list[PlannedArrangement]:
-    """Return arrangements of tags 1, 2 ... at given places (tags, 3) each."""
+    """Return arrangements of tags 1, 2, ... at given positions (tags, 3) each."""
     return [
         PlannedArrangement("", {k + 1: (x, y, z) for k, (x, y, z) in enumerate(one.tolist())}, ()) for one in places
     ]
 
 
 def promised(world: Standing, dimensions: int, curve_m: float, reflected: float) -> Floats:
-    """Return how well delays (tags,) can be known, ns, by Fisher's information of the very arrangements.
+    """Return the smallest possible standard errors of delays (tags,) in ns, by the Fisher information of the
+    arrangements.
 
-    That is a plan's promise, with a share of the pairs reflected, those of any draw. Of the curve over power, where one
-    is planted, its size is known and that it bends over 4 dB, and no more.
+    This is the prediction of a plan with a share of reflected pairs, whichever they are. Of a planted curve over power,
+    only its size is assumed to be known, and that it bends over 4 dB.
     """
     if not curve_m:
         shape = {1: "line", 2: "plane", 3: "space"}[dimensions]
@@ -154,9 +157,9 @@ def promised(world: Standing, dimensions: int, curve_m: float, reflected: float)
 
 
 def row(name: str, outcomes: dict[int, Outcome]) -> str:
-    """Return a row of the table from outcomes by seed."""
+    """Return a row of the table, given results by seed."""
     settings = dict(WORLDS[name])
-    settings.pop("said", None)
+    settings.pop("order", None)
     some = {seed: found for seed, found in outcomes.items() if not found.refused}
     refused = len(outcomes) - len(some)
     if not some:
@@ -197,7 +200,7 @@ def labels_row(name: str, outcomes: dict[int, Outcome]) -> str:
 
 
 def outcomes_of(name: str, seeds: int, results: Path | None, pool: Executor) -> dict[int, Outcome]:
-    """Return a world's outcomes by seed (from 1000 on); those in a file of results are taken from there."""
+    """Return the results of a world by seed (from 1000 on); stored results are taken from a file."""
     wanted = range(1000, 1000 + seeds)
     stored = {} if results is None else {s: o for s, o in _stored(name, results) if s in wanted}
     missing = [seed for seed in wanted if seed not in stored]

@@ -1,8 +1,8 @@
-"""How well delays are found without known distances, planted beside fitted, over seeds: a table of docs/accuracy.md.
+"""Errors of delays without known distances against planted values, over seeds: a table of docs/accuracy.md.
 
-Worlds of `tests.calib.trajectories.sines` share nothing with the fit or the simulator: bodies on sums of sines, ranges
-by plain geometry, attitudes and known places with errors. Those of scenarios are the simulator's, each seed another
-motion and noise, with a consumer's IMU; their delays are compared after the common shift, and beside those of a fit
+The worlds of `tests.calib.trajectories.sines` share no code with fit and simulator: bodies on sums of sines, ranges by
+geometry, attitudes and known positions with errors. In the worlds of scenarios, each seed gives other motion and noise
+of the simulator, with a consumer IMU; their delays are compared after the common shift, together with those of a fit
 with motion capture of the same flight.
 """
 
@@ -39,9 +39,9 @@ def _sines(seed: int, **more: Any) -> Any:
 
 
 def scenario(name: str, seed: int, seconds: float, *, alike: bool = False) -> Any:
-    """Simulate a scenario with another seed for so long, each body with an inertial sensor.
+    """Simulate a scenario with another seed and duration, each body with an IMU.
 
-    With `alike` all tags send as strongly as each other, and read powers right.
+    With `alike`, all tags have the same power, and read powers without an offset.
     """
     table = tomllib.loads((ROOT / "scenarios" / name).read_text(encoding="utf-8"))
     table["run"] |= {"seed": seed, "duration_s": seconds}
@@ -54,7 +54,9 @@ def scenario(name: str, seed: int, seconds: float, *, alike: bool = False) -> An
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """A kind of flight, what a fit may use of it, whether delays are planted in its gauge, and how many are flown."""
+    """A kind of flight, the settings of its fit, whether delays are planted in the gauge of the fit, and the number of
+    seeds.
+    """
 
     make: Callable[[int], Any]
     given: dict[str, Any]
@@ -93,7 +95,7 @@ WORLDS: Final = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """One fit: errors and standard errors of determined delays (k,) in ps, those of distances in cm, how it ended."""
+    """One fit: errors and standard errors of determined delays (k,) in ps, those of distances in cm, and its end."""
 
     claimed: int
     apart_ps: float
@@ -106,7 +108,7 @@ class Outcome:
 
 
 def one(name: str, seed: int) -> Outcome:
-    """Fly, fit without distances, and compare with what was planted."""
+    """Fly, fit without distances, and compare with the planted values."""
     world = WORLDS[name]
     flown = world.make(seed)
     result = calib.fit_from_ranges(flown, minimum_norm=True, **world.given)
@@ -141,16 +143,16 @@ def one(name: str, seed: int) -> Outcome:
 
 
 def localized_m(flown: Any, calibration: calib.Calibration) -> float:
-    """Return the position error of the robust filter with a calibration, metres.
+    """Return the position error of the robust filter with a calibration, in metres.
 
-    The plain one is thrown off by single reflected ranges, by luck more often with one calibration than the other.
+    Single reflected ranges can mislead the plain filter, with one calibration by chance more often than with another.
     """
     judged = calib.localize(flown, calibration)
     return float(np.mean([summary.rmse_m["robust"].mean() for summary in judged]))
 
 
 def row(name: str, outcomes: list[Outcome]) -> str:
-    """Return a world's line of the table."""
+    """Return the row of a world."""
 
     def rms(values: list[float]) -> float:
         return float(np.sqrt(np.nanmean(np.square(values)))) if np.isfinite(values).any() else float("nan")
@@ -195,7 +197,7 @@ HEAD: Final = f"| {' | '.join(TITLES)} |\n{'|---' * len(TITLES)}|"
 
 
 def outcomes_of(name: str, seeds: int, results: Path | None, pool: Executor) -> list[Outcome]:
-    """Return a world's outcomes; those that stand in a file of results are taken from there, new ones are added."""
+    """Return the results of a world; those in a file of results are taken from there, and new ones are added."""
     stored = {} if results is None else _stored(name, results)
     missing = [seed for seed in range(seeds) if seed not in stored]
     for seed, outcome in zip(missing, pool.map(one, [name] * len(missing), missing), strict=True):

@@ -1,8 +1,8 @@
-"""How well twins of simulated recordings find what was planted (`make twins`): as in docs/accuracy.md.
+"""Errors of twins of simulated recordings against planted values (`make twins`): a table of docs/accuracy.md.
 
-The world is of this file alone: nothing in `uwbsim.twins` was chosen on it but how offsets of tags are told from their
-antennas. Two robots and three anchors, pairs whose
-reflections differ in share and life, fading, outages, tags that send weak or read strong, dipoles.
+The world is used only here: nothing in `uwbsim.twins` was chosen with it, except the separation of offsets of tags from
+their antennas. It has two robots and three anchors, pairs whose reflections differ in share and duration, fading,
+outages, tags with low transmit power or high readings, and dipoles.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ RADIO = {
 
 
 def world(seed: int, duration_s: float) -> dict[str, Any]:
-    """Return the tables of the world, with skews and offsets of tags that follow from the seed."""
+    """Return the tables of the world, with skews and offsets of tags that depend on the seed."""
     rng = np.random.default_rng(seed)
     bodies: list[dict[str, Any]] = [
         {
@@ -83,7 +83,7 @@ def world(seed: int, duration_s: float) -> dict[str, Any]:
 
 
 def known(scenario: Scenario) -> dict[str, Any]:
-    """Return what a calibration that found everything says."""
+    """Return a calibration with the planted values."""
     planted = scenario.planted()
     curve = planted["bias_curve"]
     shape = curve | {"range": [curve["knots"][0], curve["knots"][-1]]}
@@ -104,7 +104,7 @@ def known(scenario: Scenario) -> dict[str, Any]:
 
 
 def shares(scenario: Scenario) -> dict[str, float]:
-    """Return what share of reflections was drawn for each pair."""
+    """Return the share of reflections that was drawn for each pair."""
     model = scenario.radio.multipath
     if not isinstance(model, TwoStateMultipath):
         raise TypeError("the world has two states")
@@ -121,7 +121,7 @@ def _found(name: str) -> Callable[[Scenario, Twin], float]:
 
 
 def _skew(scenario: Scenario, twin: Twin) -> float:
-    """Return the rms error of skews about the mean of all."""
+    """Return the rms error of skews relative to the mean of all."""
     errors = [b.skew_ppm - a.skew_ppm for a, b in zip(scenario.tags, twin.scenario.tags, strict=True)]
     return float(np.std(errors))
 

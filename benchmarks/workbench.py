@@ -1,4 +1,4 @@
-"""Measure the protocol workbench: engines side by side, workers, the overhead of Dask, memory of a sweep."""
+"""Measure comparisons of protocols and sweeps: the two engines, workers, the overhead of Dask, memory of a sweep."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ seeds = {seeds}
 
 
 def main() -> None:
-    """Print one row a figure."""
+    """Print one row per figure."""
     if len(sys.argv) > 1:
         print(MEASURES[sys.argv[1]](*sys.argv[2:]))
         return
@@ -60,14 +60,14 @@ def main() -> None:
 
 
 def alone(name: str, *arguments: str) -> str:
-    """Measure in a process of its own, with one thread for linear algebra."""
+    """Measure in a separate process, with one thread for linear algebra."""
     environment = dict(os.environ) | {"OPENBLAS_NUM_THREADS": "1"}
     words = [sys.executable, "-m", "benchmarks.workbench", name, *arguments]
     return subprocess.run(words, capture_output=True, text=True, check=True, env=environment).stdout.strip()
 
 
 def plain() -> str:
-    """Millions of ranges a second with six noisy stamps and skewed clocks."""
+    """Return millions of ranges per second with six noisy stamps and skewed clocks."""
     from uwblink.ticks import SPEED_OF_LIGHT
     from uwbsim.protocols.conditions import STATES, Conditions
 
@@ -77,7 +77,7 @@ def plain() -> str:
 
 
 def full() -> str:
-    """The same with motion, power-dependent bias and noise, reflections, whole ticks and the transmission grid."""
+    """Return the same with motion, bias and noise by power, reflections, whole ticks and the transmission grid."""
     from uwbsim.protocols.conditions import conditions_of
     from uwbsim.scenario.loading import load
 
@@ -94,7 +94,9 @@ def _rate(conditions: Any, count: int = 4_000_000) -> str:
 
 
 def engines() -> tuple[np.ndarray, np.ndarray, float]:
-    """A million ranges by integer stamps and by floats, over the same states; the standard error of a difference."""
+    """Simulate a million ranges with integer stamps and with floats over the same states; return both, with standard
+    errors.
+    """
     from uwblink.protocols.table import PROTOCOLS
     from uwblink.twr import raw_range
     from uwbsim import simulate
@@ -123,7 +125,7 @@ def variances() -> str:
 
 
 def sweep(workers: str, seeds: str = "120") -> str:
-    """Seconds of a sweep."""
+    """Return the duration of a sweep in seconds."""
     from uwbsim.sweep.design import load_design
     from uwbsim.sweep.runner import run_sweep
 
@@ -137,7 +139,7 @@ def sweep(workers: str, seeds: str = "120") -> str:
 
 
 def calibrations(workers: str, seeds: int = 40) -> str:
-    """Processor time of a run that calibrates, start of processes included, less that of its flight."""
+    """Return the processor time of a run with calibration, start of processes included, minus that of its flight."""
     from uwbsim import simulate
     from uwbsim.scenario.loading import load
     from uwbsim.sweep.design import load_design
@@ -157,14 +159,14 @@ def calibrations(workers: str, seeds: int = 40) -> str:
 
 
 def _processor_time() -> float:
-    """Return the processor time of this process and of those that it started and that ended."""
+    """Return the processor time of this process and of its ended child processes."""
     return sum(
         u.ru_utime + u.ru_stime for u in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     )
 
 
 def dask() -> str:
-    """How much longer a chunk of a second takes when Dask hands it out, measured on chunks alone."""
+    """Return the relative overhead of Dask for a chunk of one second, measured on chunks alone."""
     from distributed import Client, LocalCluster
 
     from uwblink.protocols.table import PROTOCOLS
@@ -194,7 +196,7 @@ def dask() -> str:
 
 
 def memory(seeds: str) -> str:
-    """Peak memory of a sweep in this process, in MB."""
+    """Return the peak memory of a sweep in this process, in MB."""
     from uwbsim.sweep.design import load_design
     from uwbsim.sweep.runner import run_sweep
 

@@ -1,11 +1,11 @@
-"""Worlds to judge a fit by, which share nothing with the simulator nor with what the fit assumes.
+"""Worlds for the evaluation of fits, which share no code with the simulator and no assumption with the fit.
 
-A world is ranges and the truth behind them. Bodies swim on sums of sines, powers follow distance, antennas that turn
-and a little noise, and each range has a bias by power, noise by power, the detour of a reflection if its pair is in
-one, and an error that wanders slowly. Shapes are not those of the estimator: detours are gamma or of two kinds, a
-reflection keeps its own length for as long as it lasts, noise has a little more tail than a normal one.
-
-Seeds below `FIRST_REPORTED` chose what the fit does by default; only those from there on are reported.
+A world consists of ranges and true values. Bodies move on sums of sines; powers depend on distance, antennas that turn,
+and little noise; each range has a bias and noise that depend on power, the detour of a reflection if its pair has one
+at that time, and an error that changes slowly. Distributions differ from those of the estimator: detours have a gamma
+distribution or two kinds, the detour of a reflection is constant while it lasts, and noise has slightly heavier tails
+than a normal distribution. Seeds below `FIRST_REPORTED` were used to choose defaults of the fit; only later ones are
+reported.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ LIGHT_M_PER_NS: Final = 0.299702547
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recipe:
-    """What a world is made of; times in seconds, lengths in metres, powers in dB.
+    """Parameters of a world; times are in seconds, lengths in metres, powers in dB.
 
     `share` is the share of reflected ranges, or bounds between which each pair draws its own. A reflection lasts
-    `lasts_s` on average (0: each range on its own). `by_power` is how much of the share goes with weak power (0 to 1).
-    By `lever_m` the antenna of tag 2 stands elsewhere on its body than true distances say. Ranges of a pair have a
-    constant error with a standard deviation of `offset_m`.
+    `lasts_s` on average (0: each range is independent). `by_power` is the part of the share that depends on low power
+    (0 to 1). The antenna of tag 2 is `lever_m` from the place on its body that true distances assume. `offset_m` is the
+    standard deviation of a constant error of each pair.
     """
 
     tags: int = 5
@@ -57,7 +57,7 @@ class Recipe:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class World:
-    """Ranges with the truth behind them: delays by tag in ns, and the bias in metres by lifted power."""
+    """Ranges with the true values: delays by tag in ns, and the bias in metres over lifted power."""
 
     ranges: Ranges
     delays_ns: dict[int, float]
@@ -67,7 +67,7 @@ class World:
 
 
 def bias_m(lifted: Floats) -> Floats:
-    """Return the bias at lifted powers: steep where power is weak, nearly straight above, no spline."""
+    """Return the bias at lifted powers: steep at low power, nearly linear above, and not a spline."""
     return np.asarray(0.16 * np.exp(-lifted / 0.35) - 0.035 * lifted + 0.012 * np.sin(2.5 * lifted))
 
 
@@ -77,7 +77,7 @@ def sigma_m(lifted: Floats, noise_m: float) -> Floats:
 
 
 def make(recipe: Recipe, seed: int, flight: int = 0) -> World:
-    """Draw a world; another `flight` is of the same boards and walls, with other motion, reflections and noise."""
+    """Draw a world; with another `flight`, boards and walls are the same, and motion, reflections and noise are new."""
     rng = np.random.default_rng([seed, 90_210, flight] if flight else [seed, 90_210])
     known = make(recipe, seed).notes if flight else {}
     count = int(recipe.seconds * recipe.per_second)
@@ -125,14 +125,14 @@ def make(recipe: Recipe, seed: int, flight: int = 0) -> World:
 
 
 def _elsewhere(recipe: Recipe, time_s: Floats, first: Any, second: Any) -> Floats:
-    """Return how much farther tag 2 is, whose body turns, than its lever arm says."""
+    """Return the increase of distances of tag 2, whose body turns, by the error of its lever arm."""
     other = np.where(first == 2, second, first)
     toward = np.cos(0.5 * time_s + 2 * np.pi * other / recipe.tags)
     return np.asarray(recipe.lever_m * toward * ((first == 2) | (second == 2)))
 
 
 def _distance(rng: np.random.Generator, recipe: Recipe, time_s: Floats, first: Any, second: Any) -> Floats:
-    """Return distances between bodies that swim about places of their own."""
+    """Return distances between bodies that move about their own positions."""
     angle = 2 * np.pi * (np.arange(recipe.tags + 1) + rng.uniform(0, 0.5, recipe.tags + 1)) / recipe.tags
     place = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), rng.uniform(0.5, 2, recipe.tags + 1)])
     found = np.zeros((2, len(time_s), 3))
@@ -162,7 +162,7 @@ def _powers(rng: np.random.Generator, recipe: Recipe, time_s: Floats, first: Any
 def _detours(
     rng: np.random.Generator, recipe: Recipe, time_s: Floats, which: Any, shares: Floats, lifted: Floats
 ) -> Floats:
-    """Return what reflections add to each range, whose share goes by pair."""
+    """Return the detours of reflections for each range; their share depends on the pair."""
     count = len(time_s)
     if not recipe.lasts_s:
         weak = 1 / (1 + (lifted / np.median(lifted)) ** 2)
@@ -177,7 +177,7 @@ def _detours(
             until = now + rng.exponential(mean)
             some = rows[(time_s[rows] >= now) & (time_s[rows] < until)]
             if reflected:
-                # One wall has one length, about which ranges scatter by a third.
+                # A wall has one detour, about which ranges vary by a third.
                 found[some] = _lengths(rng, recipe, 1)[0] * rng.gamma(9, 1 / 9, len(some))
             now, reflected = until, not reflected
     return found
@@ -193,7 +193,7 @@ def _lengths(rng: np.random.Generator, recipe: Recipe, count: int) -> Floats:
 
 
 def _wander(rng: np.random.Generator, recipe: Recipe, time_s: Floats, which: Any, pairs: int) -> Floats:
-    """Return an error of each pair that forgets itself within `wander_s` (Ornstein and Uhlenbeck's)."""
+    """Return an error of each pair with the correlation time `wander_s` (Ornstein-Uhlenbeck process)."""
     found = np.zeros(len(time_s))
     if not recipe.wander_m:
         return found
@@ -244,24 +244,24 @@ def remade(world: World, **columns: Any) -> World:
 
 
 def _pair(world: World, first: int, second: int) -> Any:
-    """Return which ranges are those of a pair."""
+    """Return a mask of the ranges of a pair."""
     low = np.minimum(world.ranges.initiator, world.ranges.target)
     high = np.maximum(world.ranges.initiator, world.ranges.target)
     return (low == min(first, second)) & (high == max(first, second))
 
 
 def _of(world: World, tag: int) -> Any:
-    """Return which ranges are a tag's."""
+    """Return a mask of the ranges of a tag."""
     return (world.ranges.initiator == tag) | (world.ranges.target == tag)
 
 
 def _longer(world: World, rows: Any, metres: Any) -> World:
-    """Return a world with some ranges longer."""
+    """Return a world in which some ranges are longer."""
     return remade(world, raw_m=world.ranges.raw_m + np.where(rows, metres, 0.0))
 
 
 def _noisy(world: World, times: float) -> World:
-    """Multiply the noise of a tag's end: half of a range's variance is its own."""
+    """Multiply the noise of one end, a tag: it causes half of the variance of a range."""
     rng = np.random.default_rng(5)
     more = sigma_m(world.lifted, 0.06) * np.sqrt((times**2 - 1) / 2)
     return _longer(world, _of(world, 2), more * rng.normal(size=len(more)))
@@ -274,7 +274,7 @@ def _reflected(world: World) -> World:
 
 
 def _louder(world: World) -> World:
-    """Let one tag report its receptions 3 dB stronger than they are."""
+    """Let one tag read the powers of its receptions 3 dB too high."""
     first = world.ranges.fpp1_dbm + 3.0 * (world.ranges.initiator == 2)
     second = world.ranges.fpp2_dbm + 3.0 * (world.ranges.target == 2)
     return remade(world, fpp1_dbm=first, fpp2_dbm=second)
@@ -286,7 +286,9 @@ def _late(world: World, part: float) -> Any:
 
 
 def _skewed(world: World, reply_s: float, times: float) -> World:
-    """Leave relative clock skew times half the reply in each range: single-sided without its carrier, or twice it."""
+    """Add relative clock skew times half of the reply time to ranges: single-sided ones without carrier correction, or
+    with twice that.
+    """
     skew = np.random.default_rng(7).normal(0, 4e-6, 100)
     both = skew[world.ranges.initiator] - skew[world.ranges.target]
     wrong = times * 0.5 * both * reply_s * 1e9 * LIGHT_M_PER_NS
@@ -297,7 +299,7 @@ def _skewed(world: World, reply_s: float, times: float) -> World:
 
 
 def _wrapped(world: World) -> World:
-    """Lose a wrap of 67.2 ms in third legs of 80 ms: the ratio of clocks is six times as far from one."""
+    """Lose a wrap of 67.2 ms in third intervals of 80 ms: the ratio of clock rates is six times as far from one."""
     skew = 2 * world.ranges.weight_target - 1
     ratio = (80 * (1 + skew) - 67.2) / (80 - 67.2)
     wrong = -0.5 * (ratio - 1 - skew) * 305e-6 * 1e9 * LIGHT_M_PER_NS
@@ -305,7 +307,9 @@ def _wrapped(world: World) -> World:
 
 
 def _swapped(world: World) -> World:
-    """Take receptions for transmissions: replies count for flights, with the boards' scatter of some ticks."""
+    """Exchange receptions and transmissions: reply times are taken for flights, with the jitter of boards of some
+    ticks.
+    """
     rng = np.random.default_rng(8)
     raw = -world.ranges.raw_m + 4.2 + rng.normal(0, 0.3, len(world.ranges))
     return remade(world, raw_m=raw)
@@ -344,7 +348,7 @@ PLANTED: Final[dict[str, Callable[[World], World]]] = {
     "a tag short by 20 cm for a tenth": lambda w: _longer(w, _of(w, 4) & _late(w, 0.9), -0.20),
     "a tag's delay goes with power": lambda w: _longer(w, _of(w, 1), 0.06 * np.tanh(np.log(w.lifted))),
 }
-"""What goes wrong in a recording, from the plain to the sly; delays stay what they were before."""
+"""Faults of a recording, from obvious to hidden; delays remain those before the fault."""
 
 PLANTED_TAGS: Final = {"one pair of four tags reads 45 cm long": 4, "one pair of six tags off by 5 cm": 6}
-"""How many tags such a world has, five if not said."""
+"""Number of tags of worlds that do not have five."""

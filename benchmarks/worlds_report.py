@@ -1,6 +1,6 @@
-"""How well fits do in worlds that share nothing with the simulator: the second table of docs/accuracy.md.
+"""Errors of fits in worlds that share no code with the simulator: the second table of docs/accuracy.md.
 
-Seeds are those from `FIRST_REPORTED` on, which were not used for tuning.
+Seeds start at `FIRST_REPORTED`; they were not used for tuning.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ BEGIN, END = "<!-- worlds -->", "<!-- end of worlds -->"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """A fit beside its world: errors of delays and their standard errors, those of the curve, and whether it doubts."""
+    """A fit compared with its world: errors of delays and their standard errors, those of the curve, and whether there
+    are warnings.
+    """
 
     errors_ps: tuple[float, ...]
     std_ps: tuple[float, ...]
@@ -43,9 +45,9 @@ class Outcome:
 
 
 def judged(world: World, other: World | None = None) -> Outcome:
-    """Fit a world and compare with what is behind it, after the common shift has been taken out.
+    """Fit a world and compare with the true values, after removing the common shift.
 
-    The ranges of another flight are held against what the calibration says of them.
+    The errors of another flight are compared with the predictions of the calibration.
     """
     found = calib.fit(world.ranges, between_m=0.0)
     known = found.calibration
@@ -73,12 +75,12 @@ def judged(world: World, other: World | None = None) -> Outcome:
 
 
 def clean(name: str, seed: int) -> Outcome:
-    """Judge a fit in a world without a fault."""
+    """Evaluate a fit in a world without a fault."""
     return judged(*(make(CLEAN[name], FIRST_REPORTED + seed, flight) for flight in (0, 1)))
 
 
 def alarmed(seed: int) -> list[str]:
-    """Return the warnings of a fit to a sound world, of a kind that goes by the seed."""
+    """Return the warnings of a fit in a sound world, whose kind depends on the seed."""
     kinds = [
         name
         for name, one in CLEAN.items()
@@ -89,7 +91,7 @@ def alarmed(seed: int) -> list[str]:
 
 
 def planted(name: str, seed: int) -> str:
-    """Return how a fit takes a planted fault: refused, named, right (within 3 standard errors), or silent."""
+    """Return the reaction of a fit to a planted fault: refused, named, correct (within 3 standard errors), or silent."""
     tags = next((count for word, count in TAGS.items() if word in name), 5)
     world = PLANTED[name](make(Recipe(tags=tags), FIRST_REPORTED + seed))
     try:
@@ -102,7 +104,7 @@ def planted(name: str, seed: int) -> str:
 
 
 def _two_digits(value: float) -> str:
-    """Return a number with two significant digits, and without an exponent."""
+    """Return a number with two significant digits, without an exponent."""
     return f"{float(f'{value:.2g}'):g}"
 
 
@@ -128,7 +130,7 @@ def table(outcomes: dict[str, list[Outcome]]) -> list[str]:
 
 
 def taken(found: dict[str, list[str]]) -> str:
-    """Return a list item for each way in which fits took planted faults, with those that were not noticed each time."""
+    """Return a list item for each reaction of fits to planted faults, with the faults that were not always noticed."""
     by_way: dict[str, list[str]] = {}
     for name, ways in found.items():
         by_way.setdefault(", ".join(sorted(set(ways))), []).append(name)
@@ -140,7 +142,7 @@ def taken(found: dict[str, list[str]]) -> str:
 
 
 def main() -> None:
-    """Run all worlds on all cores, and put the tables into the page."""
+    """Run all worlds on all cores, and write the tables into the page."""
     seeds = int(sys.argv[1]) if len(sys.argv) > 1 else SEEDS
     doubted = int(sys.argv[2]) if len(sys.argv) > 2 else DOUBTED
     with ProcessPoolExecutor() as pool:
@@ -165,7 +167,7 @@ def main() -> None:
 
 
 def _samples() -> str:
-    """Return the section on the paper's samples, nothing where they are not at hand."""
+    """Return the section on the published samples, "" if they are not available."""
     if not SAMPLES.exists():
         return ""
     return SAMPLES_TEXT.format(rows="\n".join(held_back.rows(SAMPLES)))

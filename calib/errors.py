@@ -14,7 +14,7 @@ class BadInputError(CalibError, ValueError):
 class UnanswerableError(CalibError, ValueError):
     """Valid input that does not determine the requested result: exit status 1.
 
-    `undetermined` are groups of tags whose delays the data do not determine, if that is the reason.
+    `undetermined` lists groups of tags whose delays the data do not determine; it is empty if the reason is another.
     """
 
     def __init__(self, text: str, *, parameter: str | None = None, undetermined: list[list[int]] | None = None) -> None:
@@ -24,8 +24,9 @@ class UnanswerableError(CalibError, ValueError):
 
 
 class LeftOutWarning(PlainWarning):
-    """Warning of measurements that are not corrected: ranges of pairs that a calibration cannot correct,
-    differences.
+    """Warning of measurements that are left out or copied without a correction.
+
+    They are ranges of pairs that a calibration cannot correct, and differences of arrival without stamps.
     """
 
 

@@ -1,4 +1,4 @@
-"""Ranges as factors of GTSAM (extra `gtsam`): poses, and delays as states, with reflections in the likelihood."""
+"""Ranges as factors of GTSAM (extra `gtsam`). Poses and changes of delays are variables, reflections are modelled."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ __all__ = ["Antenna", "range_factor"]
 
 @dataclass(frozen=True, slots=True)
 class Antenna:
-    """One end of a range: at `place_m` (3,) in the axes of the `Pose3` under a `key`, or of the world without a key."""
+    """One end of a range: an antenna at `place_m` (3,), in metres.
+
+    With a `key`, the place is in the frame of the `Pose3` under this key; without, it is in the frame of the world.
+    """
 
     place_m: Floats
     key: int | None = None
@@ -25,11 +28,11 @@ class Antenna:
 def range_factor(update: RangeUpdate, delays: DelayStates, key: int, first: Antenna, second: Antenna) -> Any:
     """Return a `gtsam.CustomFactor` for one range, from the antenna of its initiator to that of its target.
 
-    Its keys are those of both antennas, as far as they have one, and `key`: a vector of the changes of delays, in
-    metres, which the caller gives a prior (`DelayStates.covariance_m2`) and a random walk. Half of its squared error is
-    the negative logarithm of the range's likelihood, reflections and outliers included (`RangeUpdate.whiten`), so it
-    needs no robust loss, which in GTSAM does not know the sign of an error. Raises `BadInputError` without GTSAM, and
-    for several ranges.
+    Its keys are those of the antennas that have one, and `key`, the vector of the changes of delays in metres. The
+    caller adds a prior (`DelayStates.covariance_m2`) and a random walk for this vector. Half of the squared error is
+    the negative logarithm of the range's likelihood relative to its maximum; reflections and outliers are included
+    (`RangeUpdate.whiten`). So a robust loss is not needed; those of GTSAM are symmetric, but reflections only lengthen
+    ranges. Raises `BadInputError` if GTSAM is not installed, and if `update` has not exactly one range.
     """
     try:
         import gtsam

@@ -1,7 +1,7 @@
 """Figures of a calibration: errors and their distribution, curves over power, delays, and residuals.
 
-Functions that take Matplotlib axes draw into them, or into new ones, and return them. Functions that take a width in
-inches return a figure of that width (`uwblink.pages.figures`).
+Functions with a parameter `axes` draw into these Matplotlib axes, or into new ones, and return them. Functions with a
+parameter `width_in` return a new figure of that width in inches (`uwblink.pages.figures`).
 """
 
 from __future__ import annotations
@@ -41,20 +41,24 @@ PLANTED: Final[dict[str, Any]] = {"color": GREEN, "ls": (0, (5, 1.5))}
 """Line style of a planted curve."""
 
 MIN_RANGES_PER_BIN: Final = 60
-"""With so many ranges, a tenth of them reflected, the error model is known to 15 %; with fewer the median is drawn."""
+"""Number of ranges from which the error model is fitted in a bin; smaller bins show the median. With 60 ranges, a tenth
+of them reflected, the standard errors of its parameters are 15 %."""
 
 MOST_RANGES_PER_BIN: Final = 2000
-"""With so many ranges the standard error of the centre is a fortieth of the noise, less than a drawn point."""
+"""Largest number of ranges of a bin that are fitted: the standard error of the centre is then a fortieth of the noise,
+less than the size of a drawn point."""
 
 MOST_PAIRS: Final = 24
-"""Pairs whose errors are drawn over time, those with the largest spread."""
+"""Largest number of pairs in a figure of pairs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Binned:
     """Errors by lifted power: median power, centre, standard deviation and median of each bin (bins,), metres.
 
-    Centre and deviation are those of direct ranges if the curve was fitted to these, else those of all ranges.
+    In bins with enough ranges, centre and standard deviation are those of direct ranges. In smaller bins, the centre is
+    the median of all ranges and the standard deviation that of all ranges. With least squares, both are those of all
+    ranges in every bin, and the centre is the mean.
     """
 
     lifted: Floats
@@ -66,9 +70,9 @@ class Binned:
 def over_power(
     ranges: Ranges, applied: CorrectedRanges, calibration: Calibration, which: Literal["bias", "sigma"]
 ) -> dict[str, Binned]:
-    """Return errors by lifted power, of each pair by name in 6 bins, and of "all" in 20.
+    """Return errors by lifted power: of each pair, by its name, in 6 bins, and of "all" ranges in 20 bins.
 
-    They are the delay-corrected errors for the "bias" curve, and the fully corrected ones for "sigma".
+    For the "bias" curve these are errors of delay-corrected ranges; for "sigma", errors of fully corrected ranges.
     """
     error_m = (applied.delay_corrected_m if which == "bias" else applied.corrected_m) - ranges.truth_m
     sets = {name: (np.flatnonzero(rows), 6) for name, rows in pair_rows(ranges).items()}
@@ -76,10 +80,10 @@ def over_power(
 
 
 def binned(lifted: Floats, error_m: Floats, sets: Mapping[str, tuple[Ints, int]], loss: str) -> dict[str, Binned]:
-    """Return errors (n,) of sets of rows, by lifted power (n,) in a number of bins of equal counts, as a fit has them.
+    """Return errors (n,) by lifted power (n,), for each of the `sets`: rows and a number of bins with equal counts.
 
-    The curve of a fit follows the errors of direct ranges; reflections only lengthen, so medians and means lie above
-    it. Least squares ("l2") follow the mean.
+    A fitted curve follows the errors of direct ranges. Reflections lengthen ranges, so the median and the mean of all
+    errors lie above the curve. With least squares (`loss` "l2") the curve follows the mean.
     """
     groups = {
         name: np.array_split(rows[np.argsort(lifted[rows])], max(1, min(bins, len(rows) // MIN_RANGES_PER_BIN)))
@@ -90,32 +94,32 @@ def binned(lifted: Floats, error_m: Floats, sets: Mapping[str, tuple[Ints, int]]
     medians = [np.median(e) for e in errors]
     centre_m = np.array([np.mean(e) for e in errors] if loss == "l2" else medians)
     std_m = np.array([np.std(e) for e in errors])
-    told = [k for k, e in enumerate(errors) if len(e) >= MIN_RANGES_PER_BIN and float(np.ptp(e)) >= 1e-9]
-    if loss != "l2" and told:
-        core = fit_grouped_errors([errors[k] for k in told], MOST_RANGES_PER_BIN)
-        centre_m[told], std_m[told] = core.centre_m, core.sigma_m
+    fitted = [k for k, e in enumerate(errors) if len(e) >= MIN_RANGES_PER_BIN and float(np.ptp(e)) >= 1e-9]
+    if loss != "l2" and fitted:
+        core = fit_grouped_errors([errors[k] for k in fitted], MOST_RANGES_PER_BIN)
+        centre_m[fitted], std_m[fitted] = core.centre_m, core.sigma_m
     ends = np.cumsum([len(some) for some in groups.values()])[:-1]
     parts = zip(*(np.split(column, ends) for column in (powers, centre_m, std_m, medians)), strict=True)
     return {name: Binned(*own) for name, own in zip(groups, parts, strict=True)}
 
 
 def histogram(ranges: Ranges, applied: CorrectedRanges, axes: Axes | None = None) -> Axes:
-    """Draw range errors in the three stages, in cm; the outermost bins hold everything beyond them."""
+    """Draw histograms of range errors in the three stages, in cm; the outermost bins include all larger errors."""
     axes = axes or new_axes()
     errors = _errors_cm(ranges, applied)
     low, high = np.quantile(errors["full"], (0.01, 0.99))
     margin = 0.05 * float(high - low) + 0.1
-    # Raw errors are in the picture unless they are far off.
+    # Include the raw errors, but at most twice the span of the corrected ones on either side.
     reach, raw = 2 * (high - low), np.quantile(errors["raw"], (0.02, 0.98))
     low, high = max(min(low, raw[0]), low - reach) - margin, min(max(high, raw[1]), high + reach) + margin
     lines = {stage: {"lw": 1.3, **line} for stage, line in STAGE_LINES.items()}
     outlines(axes, errors, np.linspace(low, high, 41), lines)
     label(axes, "range error (cm)", "ranges (%)")
-    return _explained(axes)
+    return _with_legend(axes)
 
 
 def cumulative(ranges: Ranges, applied: CorrectedRanges, axes: Axes | None = None) -> Axes:
-    """Draw the share of ranges whose error is smaller than a size, in the three stages."""
+    """Draw the distribution functions of absolute range errors in the three stages."""
     axes = axes or new_axes()
     errors = {stage: np.abs(error) for stage, error in _errors_cm(ranges, applied).items()}
     shares = np.concatenate([np.linspace(0, 0.98, 150), np.linspace(0.981, 1, 20)])
@@ -124,7 +128,7 @@ def cumulative(ranges: Ranges, applied: CorrectedRanges, axes: Axes | None = Non
     full, raw = (float(np.quantile(errors[stage], 0.99)) for stage in ("full", "raw"))
     axes.set(xlim=(0, max(full, min(raw, 4 * full), 1e-9)), ylim=(0, 100), yticks=[0, 25, 50, 75, 95])
     label(axes, "absolute range error (cm)", "ranges with smaller error (%)")
-    return _explained(axes)
+    return _with_legend(axes)
 
 
 def curve_over_power(
@@ -135,10 +139,10 @@ def curve_over_power(
     axes: Axes | None = None,
     found: Mapping[str, Binned] | None = None,
 ) -> Axes:
-    """Draw the "bias" or "sigma" curve over lifted power with its band, the planted curve, and errors of pairs and of
-    all ranges.
+    """Draw the "bias" or "sigma" curve over lifted power with its 95 % band, the planted curve, and measured errors.
 
-    Errors are those of `over_power`, or `found` if given; for the bias their medians are drawn as well.
+    The errors of each pair and of all ranges are `found`, or by default those of `over_power`. With the bias, the
+    medians of all ranges are drawn, too.
     """
     axes, found = axes or new_axes(), found or over_power(ranges, applied, calibration, which)
     bias, squares = which == "bias", calibration.loss == "l2"
@@ -151,15 +155,15 @@ def curve_over_power(
     axes.plot(everything.lifted, values["all"], "o", color=INK, ms=3, label=text, zorder=4)
     curve = calibration.bias_curve if bias else calibration.sigma_curve
     grid = np.linspace(*curve.range, 300)
-    keep_strays_out(axes, np.concatenate([*values.values(), 100 * curve(grid)]))
+    limit_without_outliers(axes, np.concatenate([*values.values(), 100 * curve(grid)]))
     if bias and not squares:
         medians = 100 * everything.median_m
         axes.plot(everything.lifted, medians, "_", color=MUTED, ms=6, label="medians, reflections included")
     _curve(axes, calibration, which, grid, 100 * curve(grid), color=BLUE, lw=1.6, label="fitted", zorder=3)
     planted = planted_curve(ranges, f"{which}_curve", grid)
     if planted is not None:
-        beside = compare_with_planted(ranges, applied, calibration) if bias else None
-        planted += 0.0 if beside is None else beside.shift_ns * 1e-9 * SPEED_OF_LIGHT
+        compared = compare_with_planted(ranges, applied, calibration) if bias else None
+        planted += 0.0 if compared is None else compared.shift_ns * 1e-9 * SPEED_OF_LIGHT
         axes.plot(grid, 100 * planted, label="planted, same gauge" if bias else "planted", **PLANTED)
     if not bias:
         axes.set_ylim(bottom=0)
@@ -167,13 +171,13 @@ def curve_over_power(
     name = f"lifted power ψ = 10^((p − α) / 10 dB), α = {alpha:g} dBm".replace("-", "−")
     label(axes, name, "bias (cm)" if bias else "standard deviation (cm)")
     _powers_above(axes, alpha)
-    return _explained(axes)
+    return _with_legend(axes)
 
 
 def _curve(
     axes: Axes, calibration: Calibration, which: Literal["bias", "sigma"], grid: Floats, values: Floats, **line: Any
 ) -> None:
-    """Draw values of a curve (n,) in cm over lifted powers (n,), with the band of 95 % where there is one."""
+    """Draw values of a curve (n,) in cm over lifted powers (n,), with its 95 % band if that is known."""
     std_m = calibration.band(grid, which)
     half = None if std_m is None else 100 * TWO_SIDED_95 * std_m
     between = None if half is None else (values - half, values + half)
@@ -198,10 +202,10 @@ def delays(
     shift_ns: float = 0.0,
     axes: Axes | None = None,
 ) -> Axes:
-    """Draw delays in ns with 95 % intervals, and planted delays moved by the common shift.
+    """Draw delays in ns with 95 % intervals, and planted delays plus the common shift `shift_ns`.
 
-    A delay far from all others is written at the edge; one without an interval is a circle; tags of which only sums are
-    determined are left out. Raises `UnanswerableError` where none is left.
+    A delay far from all others is written at the upper edge. A delay without an interval is a circle. Tags of which
+    only sums of delays are determined are left out; raises `UnanswerableError` if none remains.
     """
     known_std = calibration.interval_std_ns()
     if not known_std:
@@ -222,7 +226,7 @@ def delays(
     if planted_ns:
         axes.plot(place + beside, known, "x", ms=5, mew=1.4, color=GREEN, label="planted, same gauge")
     near = np.concatenate([values[inside], known[inside & np.isfinite(known)]])
-    # A wide interval may leave the picture.
+    # An interval that is much wider than the others is cut off.
     bar = min(half[bounded].max(), 4 * np.median(half[bounded])) if bounded.any() else 0.0
     margin = 0.08 * float(np.ptp(near)) + bar + 1e-6
     axes.set_ylim(near.min() - margin, near.max() + (1.0 if inside.all() else 2.2) * margin)
@@ -233,31 +237,35 @@ def delays(
     axes.set_xticks(place[every], [str(tag) for tag in tags[every]])
     axes.margins(x=0.06)
     label(axes, "tag", "antenna delay (ns)")
-    return _explained(axes)
+    return _with_legend(axes)
 
 
 def _intervals(axes: Axes, place: Any, values: Floats, half: Floats, text: str) -> None:
-    """Draw points with their intervals, and zero."""
+    """Draw points with their intervals, and a line at zero."""
     axes.errorbar(place, values, half, fmt="o", ms=3.5, capsize=2.5, color=BLUE, label=text)
     axes.axhline(0, color=PALE, lw=0.7, zorder=0)
 
 
 def within_fence(values: Floats) -> Any:
-    """Return which values (n,) determine the limits of an axis: those within 12 median deviations of the median."""
+    """Return a mask (n,) of the values that determine the limits of an axis.
+
+    They lie within 12 median absolute deviations of the median, or eight standard deviations of a normal distribution.
+    If more than half of the values are equal, all are inside.
+    """
     away = np.abs(values - np.median(values))
     usual = float(np.median(away))
     return away <= (12.0 * usual if usual > 0 else np.inf)
 
 
-def keep_strays_out(axes: Axes, values: Floats) -> None:
-    """Set the limits of the vertical axis by values (n,) without outliers."""
+def limit_without_outliers(axes: Axes, values: Floats) -> None:
+    """Set the limits of the vertical axis to values (n,) without outliers."""
     inside = values[within_fence(values)]
     margin = 0.12 * float(np.ptp(inside)) + 1e-9
     axes.set_ylim(inside.min() - margin, inside.max() + margin)
 
 
 def patterns(width_in: float, calibration: Calibration, ranges: Ranges | None = None) -> Figure:
-    """Draw the six largest patterns over azimuth with bands of 95 %, at elevations of the directions in `ranges`."""
+    """Draw the six patterns with the largest rms over azimuth, with 95 % bands, at elevations found in `ranges`."""
     largest = sorted(calibration.patterns, key=lambda one: -one.rms_m)[:6]
     polar: dict[str, Any] = {"subplot_kw": {"projection": "polar"}, "height_in": 3.2}
     figure, panels = sheet(width_in, len(largest), across=min(len(largest), int(width_in / 3)), **polar)
@@ -285,7 +293,10 @@ def patterns(width_in: float, calibration: Calibration, ranges: Ranges | None = 
 
 
 def _elevations(calibration: Calibration, ranges: Ranges | None) -> list[float]:
-    """Return the middle elevation in radians of directions at tags with patterns, and those of 10 and 90 % if apart."""
+    """Return the median elevation in radians of the directions at tags with patterns.
+
+    If the 10 % and 90 % quantiles are more than 30° apart, these follow it.
+    """
     tags = [tag for one in calibration.patterns for tag in one.tags]
     z = np.zeros(1)
     if ranges is not None:
@@ -302,8 +313,8 @@ def new_axes() -> Axes:
     return pyplot.subplots(figsize=(WIDTHS["page"], 3.2), layout="constrained")[1]
 
 
-def alone(draw: Callable[[Axes], Axes], width_in: float) -> Figure:
-    """Return a figure of a width in inches, drawn into its only axes."""
+def single_figure(draw: Callable[[Axes], Axes], width_in: float) -> Figure:
+    """Return a figure with one pair of axes, into which `draw` draws."""
     figure, (axes,) = sheet(width_in, height_in=3.1)
     draw(axes)
     return figure
@@ -313,8 +324,8 @@ def _errors_cm(ranges: Ranges, applied: CorrectedRanges) -> dict[str, Floats]:
     return {stage: 100 * (getattr(applied, name) - ranges.truth_m) for stage, name in CORRECTION_STAGES.items()}
 
 
-def _explained(axes: Axes) -> Axes:
-    """Add the legend: above axes that have their own figure, else inside."""
+def _with_legend(axes: Axes) -> Axes:
+    """Add a legend and return the axes. It is above axes that have their own figure, else inside."""
     figure = axes.figure
     if isinstance(figure, Figure) and len(figure.axes) == 1 and figure.get_layout_engine() is not None:
         legend(figure, axes)
@@ -324,16 +335,16 @@ def _explained(axes: Axes) -> Axes:
 
 
 def distribution(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figure:
-    """Draw errors in the three stages: shares by size and sign, and how many are smaller than a size."""
+    """Draw the errors in the three stages: histograms, and distribution functions of absolute errors."""
     figure, (left, right) = sheet(width_in, 2)
     for axes in (histogram(ranges, applied, left), cumulative(ranges, applied, right)):
-        axes.legend_ = None  # one for both
+        axes.legend_ = None  # the figure has one legend for both
     legend(figure)
     return figure
 
 
 def z_scores(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figure:
-    """Draw errors over their sigma: a histogram beside the normal density, and the share of errors beyond a size."""
+    """Draw errors divided by their sigma: a histogram with the normal density, and the share of larger errors."""
     z = (applied.corrected_m - ranges.truth_m) / applied.sigma_m
     figure, (left, right) = sheet(width_in, 2)
     grid = np.linspace(-6, 6, 61)
@@ -343,7 +354,7 @@ def z_scores(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figur
     beyond = 100 * float(np.mean(np.abs(z) > 6))
     label(left, f"error divided by its σ ({beyond:.1f} % outside ± 6)", "density")
     size = np.sort(np.abs(z))
-    # The largest errors are single ones: the line ends where ten are left.
+    # The tail has few errors and is noisy: the line ends where ten are left.
     shown = slice(None, max(1, len(size) - 10), len(size) // 1000 + 1)
     right.semilogy(size[shown], (100 * (1 - np.arange(len(size)) / len(size)))[shown], color=BLUE, lw=1.4)
     grid = np.linspace(0, 4, 81)
@@ -356,7 +367,7 @@ def z_scores(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figur
 
 
 def residuals(width_in: float, ranges: Ranges, applied: CorrectedRanges, alpha_dbm: float) -> Figure:
-    """Draw calibrated errors over distance and over first-path power, with medians and the middle 68 %."""
+    """Draw calibrated errors over distance and over lifted power in dBm, with medians and the middle 68 %."""
     figure, panels = sheet(width_in, 2, sharey=True)
     error = 100 * (applied.corrected_m - ranges.truth_m)
     power = 10 * np.log10(np.maximum(applied.lifted, 1e-9)) + alpha_dbm
@@ -370,7 +381,7 @@ def residuals(width_in: float, ranges: Ranges, applied: CorrectedRanges, alpha_d
         series(panel, middle, median, (low, high), band="middle 68 %", **line)
         panel.axhline(0, color=MUTED, lw=0.7)
         panel.set_xlim(*np.quantile(x, (0.001, 0.999)) + np.array([-1e-6, 1e-6]))
-        # Labels like -97.5 are wide: there is room for fewer than by default.
+        # Labels such as -97.5 are wide, so fewer than by default fit.
         panel.locator_params(axis="x", nbins=7, steps=[1, 2, 5, 10])
         label(panel, name, "calibrated error (cm)" if panel is panels[0] or width_in < NARROW_IN else "")
     panels[0].set_ylim(*bulk(error))
@@ -379,9 +390,9 @@ def residuals(width_in: float, ranges: Ranges, applied: CorrectedRanges, alpha_d
 
 
 def over_time(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figure:
-    """Draw the calibrated error of each pair over time, with the band in which 95 % should lie.
+    """Draw the calibrated errors of each pair over time, with the band that contains 95 % of direct ranges.
 
-    Of many pairs those whose errors spread most are drawn.
+    If there are more than 24 pairs, those with the largest spread of errors are drawn.
     """
     error = 100 * (applied.corrected_m - ranges.truth_m)
     rows = {name: np.flatnonzero(own) for name, own in pair_rows(ranges).items()}
@@ -394,7 +405,8 @@ def over_time(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figu
         order = rows[name][np.argsort(time[rows[name]])]
         shown, some = order[:: max(1, len(order) // 800)], order[:: max(1, len(order) // 120)]
         panel.plot(time[shown], error[shown], ".", ms=1.3, color=BLUE, alpha=0.6, rasterized=True)
-        panel.plot(time[some], applied.sigma_m[some, None] * [-196, 196], color=INK, lw=0.6)
+        half = 100 * TWO_SIDED_95 * applied.sigma_m[some]
+        panel.plot(time[some], np.column_stack([-half, half]), color=INK, lw=0.6)
         panel.set_title(f"tags {name}", pad=2)
         label(panel, "", "")
     panels[0].set_ylim(*bulk(error))
@@ -406,7 +418,7 @@ def over_time(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figu
 def errors_by_pair(width_in: float, found: Evaluation) -> Figure:
     """Draw the median error of each pair before and after correction, with bars of one robust standard deviation.
 
-    Of more than 24 pairs those whose raw medians are farthest off are drawn.
+    If there are more than 24 pairs, those with the largest raw medians are drawn.
     """
     figure, (axes,) = sheet(width_in, height_in=2.2)
     farthest = sorted(found.pairs, key=lambda name: -abs(found.pairs[name].raw.median_m))[:MOST_PAIRS]
@@ -424,13 +436,13 @@ def errors_by_pair(width_in: float, found: Evaluation) -> Figure:
 
 
 def differences(width_in: float, found: CalibrationComparison) -> Figure:
-    """Draw the difference of each delay, second less first, with 95 % intervals and without the common shift."""
+    """Draw the difference of each delay, second minus first, without the common shift, with 95 % intervals."""
     figure, (axes,) = sheet(width_in, height_in=2.6)
     tags = sorted(found.difference_ns)
     values = 1e3 * np.array([found.difference_ns[tag] for tag in tags])
     half = 1e3 * TWO_SIDED_95 * np.nan_to_num([found.std_ns[tag] for tag in tags])
     _intervals(axes, range(len(tags)), values, half, "difference, 95 % interval")
-    keep_strays_out(axes, np.concatenate([values - half, values + half, [0.0]]))
+    limit_without_outliers(axes, np.concatenate([values - half, values + half, [0.0]]))
     axes.set_xticks(range(len(tags)), [str(tag) for tag in tags])
     label(axes, "tag", "difference of the delay (ps)")
     legend(figure)
@@ -438,7 +450,7 @@ def differences(width_in: float, found: CalibrationComparison) -> Figure:
 
 
 def both_curves(width_in: float, known: Sequence[Calibration], names: Sequence[str]) -> Figure:
-    """Draw bias curves of two calibrations about their own means, and sigma curves, over lifted power."""
+    """Draw the curves of two calibrations over lifted power: bias, each minus its own mean, and sigma."""
     figure, (left, right) = sheet(width_in, 2)
     lines: tuple[dict[str, Any], ...] = ({"color": VERMILION, "ls": (0, (5, 1.5))}, {"color": BLUE})
     for one, name, line in zip(known, names, lines, strict=True):

@@ -1,10 +1,10 @@
 """Findings and checks, and the tests that turn a statistic into a p-value.
 
-A check asks one question of a recording or of a fit. Its statistic has a known distribution if nothing is wrong, which
-gives a p-value; all checks share one budget of false alarms. What a sound recording may show besides chance (the delay
-of a warm board, a lever arm measured with a ruler) is a tolerance: the null hypothesis is "no more than the tolerance"
-(a minimum-effect test, Murphy and Myors 1999), so a small fault does not become a finding because a recording is long.
-Other conditions can only suppress a finding, so p-values stay valid.
+A check asks one question of a recording or of a fit. Its statistic has a known distribution on sound data, which gives
+a p-value. All checks share one budget of false alarms. Sound recordings have small systematic errors, such as the delay
+of a warm board or a lever arm measured with a ruler. They are a tolerance: the null hypothesis is "at most the
+tolerance" (a minimum-effect test, Murphy and Myors 1999). So a small error does not become a finding because a
+recording is long. Other conditions can only suppress a finding, so p-values stay valid.
 """
 
 from __future__ import annotations
@@ -20,30 +20,34 @@ from scipy import special
 from uwblink.arrays import Floats
 
 BUDGET: Final = 0.01
-"""Share of sound recordings with any finding by chance: checks of a recording and of its fit share it (Bonferroni)."""
+"""Share of sound recordings with at least one false finding; checks of a recording and of its fit share it
+(Bonferroni)."""
 
 OF_A_FIT: Final = BUDGET / 2
-"""Share of sound fits with any finding by chance, all alternatives together; the other half is the recording's."""
+"""Share of sound fits with at least one false finding, over all alternatives. The other half of the budget belongs to
+the checks of the recording."""
 
 SMALLEST_NS: Final = 0.02
-"""Error of a delay below which no fault is named: 3 mm of a range."""
+"""Smallest error of a delay that is a finding: 3 mm of a range."""
 
 NAMED_DETOUR_M: Final = 0.12
-"""Detours that are named: shorter ones may as well be noise that is not normal, or an error that wanders. In
-some flights of the simulator's six robots, without a fault, a fifth of the ranges is taken for reflected by 8 cm."""
+"""Smallest mean detour that is a finding. Noise that is not normal, or that changes slowly, looks like shorter detours:
+in some simulated flights of six robots without a fault, a fifth of the ranges is fitted as reflected by 8 cm."""
 
 STRETCHES: Final = 16
-"""Stretches of time over which a statistic is averaged: their variance is then known to about a third."""
+"""Number of stretches of time over which a statistic is averaged. The relative standard error of the variance of 16
+means is about a third: the root of 2/15."""
 
 CERTAIN: Final = "none: no chance is involved"
+"""Distribution (`Check.sound`) of a check whose findings are certain."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
     """A fault or a limit: its name, the evidence, the remedy, and the probability that sound data show as much.
 
-    `p_value` is 0 if no chance is involved, as for numbers that contradict each other, and None if nothing was tested,
-    as for a limit of the data.
+    `p_value` is 0 if no chance is involved, for example if numbers contradict each other, and None if nothing was
+    tested, as for a limit of the data.
     """
 
     fault: str
@@ -139,8 +143,8 @@ def warning(fault: str, evidence: str, p_value: float | None = None) -> Finding:
 class Candidate:
     """A possible finding of a check: the fault, its evidence, its p-value, and words that complete the remedy.
 
-    A check that involves no chance states no p-value. `gain` is by how much undoing the fault reduces the errors of the
-    recording, where undoing it is the test.
+    A check that involves no chance states no p-value. `gain` is the reduction of the recording's errors if the fault is
+    undone; 0 for checks that do not undo it.
     """
 
     fault: str
@@ -154,7 +158,8 @@ class Candidate:
 class Check:
     """A row of the table of checks: stage, question, statistic, its distribution on sound data, and remedies.
 
-    `remedies` maps names of faults to what to do, with fields for the words of a candidate; `look` yields candidates.
+    `remedies` maps names of faults to remedies, with format fields for the `words` of a candidate. `look` is a function
+    that yields candidates.
     """
 
     stage: str
@@ -200,7 +205,11 @@ def contradictions_in(provenance: Mapping[str, Any]) -> list[str]:
 
 
 def exceeds(value: float, std: float, dof: float, *, tolerance: float = 0.0, tried: float = 1) -> float:
-    """Return the p-value of a value whose true size is the tolerance at most, by Student's t; `tried` were tested."""
+    """Return the p-value of a value with a standard error, by Student's t with `dof` degrees of freedom.
+
+    The null hypothesis is that the true absolute value is at most `tolerance`. `tried` is the number of tests, over
+    which the p-value is corrected (Bonferroni). Returns 1 for values that are not finite.
+    """
     if not np.isfinite(value) or not np.isfinite(std):
         return 1.0
     over = (abs(value) - tolerance) / max(std, 1e-12)
@@ -208,7 +217,11 @@ def exceeds(value: float, std: float, dof: float, *, tolerance: float = 0.0, tri
 
 
 def positive(values: Floats, *, tried: float = 1) -> float:
-    """Return the p-value of values (n,) of stretches of time whose true mean is 0 or less, by Student's t."""
+    """Return the p-value of values (n,) of stretches of time, by Student's t.
+
+    The null hypothesis is that their mean is at most 0. `tried` is the number of tests (Bonferroni). Returns 1 if fewer
+    than half of `STRETCHES` values are finite.
+    """
     good = values[np.isfinite(values)]
     if len(good) < STRETCHES // 2:
         return 1.0
@@ -217,12 +230,18 @@ def positive(values: Floats, *, tried: float = 1) -> float:
 
 
 def more_often(count: int, of: int, chance: float, *, tried: float = 1) -> float:
-    """Return the p-value of at least `count` successes in independent trials with a probability of `chance`."""
+    """Return the probability of at least `count` successes in `of` independent trials with probability `chance`.
+
+    It is multiplied by the number of tests `tried` (Bonferroni), and at most 1.
+    """
     return min(1.0, tried * float(special.bdtrc(count - 1, of, chance))) if count > 0 else 1.0
 
 
 def stretches(count: int, fewest: int = 30) -> list[slice]:
-    """Return stretches of equal count of `count` rows in order of time, none where they have less than the `fewest`."""
+    """Divide `count` rows, in order of time, into at most `STRETCHES` stretches of equal count.
+
+    Each has at least `fewest` rows. Returns none if this allows fewer than half of `STRETCHES`.
+    """
     some = min(STRETCHES, count // fewest)
     edges = np.linspace(0, count, some + 1).astype(int) if some >= STRETCHES // 2 else np.zeros(1, dtype=int)
     return [slice(a, b) for a, b in pairwise(edges.tolist())]

@@ -1,9 +1,9 @@
-"""Directions that an information matrix determines, and a description of those it does not.
+"""Which unknowns an information matrix determines, and a description of the combinations that it leaves free.
 
-An information matrix (the inverse of a covariance, J' W J of a fit) is singular along directions without information,
-and nearly singular along directions with little. A direction is judged in units of prior knowledge (`scale` of each
-unknown): an antenna delay is known to a nanosecond without any data, so an estimate with a larger standard error has no
-value.
+An information matrix (J' W J of a fit, the inverse of a covariance) is singular along directions without information,
+and nearly singular along directions with little information. Each unknown has a prior standard deviation (`scale`), in
+whose units directions are judged: an antenna delay is known to a nanosecond without data, so an estimate with a larger
+standard error is useless.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from calib.errors import BadInputError
 from uwblink.arrays import Bools, Floats
 
 LOOSEST: Final = 0.5
-"""Largest standard deviation of a determined direction, as a share of its prior one: the data then weigh four times as
-much as the prior."""
+"""Largest standard deviation of a determined direction, relative to its prior one. The data then have four times the
+information of the prior."""
 
 ROUNDING: Final = 1e-12
 """Eigenvalues below this share of the largest one are rounding errors."""
 
 TAKES_PART: Final = 0.02
-"""An unknown is named if its part of a free direction exceeds this share of the largest part."""
+"""Smallest component of a free direction, relative to its largest one, whose unknown is named."""
 
 
 @dataclass(frozen=True, slots=True)
 class InformationColumn:
-    """One column of an information matrix: what it is ("delay"), of what ("3"), and how far it is known without data.
+    """One unknown, a column of an information matrix: its kind ("delay"), its owner `of` ("3"), and its prior `scale`.
 
-    Several columns may be the same thing of the same (the three coordinates of a position), and are named once.
+    Columns with equal kind and owner, such as the three coordinates of a position, are named once.
     """
 
     kind: str
@@ -41,16 +41,16 @@ class InformationColumn:
     scale: float = 1.0
 
     def __str__(self) -> str:
-        """Return both words."""
+        """Return kind and owner, such as "delay of 3"."""
         return f"{self.kind} of {self.of}" if self.of else self.kind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """What an information matrix determines.
+    """The unknowns that an information matrix determines.
 
-    `std` (n,) is infinite where the data do not determine an unknown, and `covariance` (n, n) is NaN in its row and
-    column. `free` are the combinations of unknowns that the data leave free, in words.
+    `std` (n,) is the standard deviation of each unknown, infinite if the data do not determine it. `covariance` (n, n)
+    is NaN in the rows and columns of these. `free` describes the combinations of unknowns that the data leave free.
     """
 
     unknowns: tuple[InformationColumn, ...]
@@ -60,24 +60,25 @@ class Verdict:
 
     @property
     def determined(self) -> Bools:
-        """Which unknowns (n,) the data determine."""
+        """Mask (n,) of the unknowns that the data determine."""
         return np.isfinite(self.std)
 
     def named(self, kind: str) -> tuple[str, ...]:
-        """Return of what a kind of unknown is not determined, each once and in order: tags whose delay is free."""
+        """Return the owners of undetermined unknowns of a kind, each once and in order, such as tags for "delay"."""
         loose = zip(self.unknowns, self.determined.tolist(), strict=True)
         return tuple(dict.fromkeys(u.of for u, known in loose if u.kind == kind and not known))
 
     def __str__(self) -> str:
-        """Return what is free, a line each."""
+        """Return the free combinations, one per line."""
         return "\n".join(self.free) or "all unknowns are determined"
 
 
 def judge(information: Floats, unknowns: Sequence[InformationColumn], *, loosest: float = LOOSEST) -> Verdict:
-    """Return what a positive semi-definite information matrix (n, n) says of its unknowns.
+    """Return which of the `unknowns` (n,) a positive semi-definite information matrix (n, n) determines.
 
-    A direction, or an unknown, counts as determined where its standard deviation is at most `loosest` times the scale
-    (of a direction: of its parts together). Raises `BadInputError` for a matrix that is none.
+    Unknowns are divided by their scales. An unknown, or a direction of unit length, is determined if its standard
+    deviation is at most `loosest`. Raises `BadInputError` if the matrix has another shape, is not finite, not symmetric
+    or not positive semi-definite, and if `loosest` is not positive.
 
     >>> import numpy as np
     >>> from calib.information import InformationColumn, judge
@@ -91,7 +92,7 @@ def judge(information: Floats, unknowns: Sequence[InformationColumn], *, loosest
     largest = max(float(values[-1]), 0.0)
     if values[0] < -math.sqrt(ROUNDING) * largest:
         raise BadInputError(f"has the eigenvalue {values[0]:.3g}, expected none below 0", parameter="information")
-    # Rounding lifts a free direction to this at most; below it there is nothing, and what is nothing is made as loose.
+    # Rounding errors of a zero eigenvalue are at most this large. Such directions get the standard deviation of it.
     nothing = values <= ROUNDING * len(values) * largest
     spread = vectors / np.sqrt(np.where(nothing, max(ROUNDING * largest, 1e-300), values))
     deviation = np.linalg.norm(spread, axis=1)
@@ -106,9 +107,9 @@ def judge(information: Floats, unknowns: Sequence[InformationColumn], *, loosest
 
 
 def reduced(information: Floats, keep: Sequence[int] | Bools) -> Floats:
-    """Return the information (k, k) on some of the unknowns (indices or a mask), whatever the others are.
+    """Return the information (k, k) on the unknowns to `keep` (indices or a mask) if the others are estimated, too.
 
-    That is the Schur complement; what the others leave free stays free.
+    It is the Schur complement; a pseudo-inverse leaves out directions of the others without information.
     """
     count = len(information)
     mask = np.zeros(count, dtype=bool)
@@ -122,7 +123,7 @@ def reduced(information: Floats, keep: Sequence[int] | Bools) -> Floats:
     root = (information[np.ix_(kept, rest)] / size) @ vectors[:, good] / np.sqrt(values[good])
     given = information[np.ix_(kept, kept)]
     found = given - root @ root.T
-    # The difference has rounding errors of the size of what it was taken from, and may be all there is: none below 0.
+    # Rounding errors of the difference are relative to `given`, and may exceed it: remove eigenvalues below that.
     unit = np.sqrt(np.maximum(np.diag(given), 1e-300))
     values, vectors = np.linalg.eigh((found + found.T) / 2 / unit[:, None] / unit)
     values[values < ROUNDING * len(kept)] = 0.0
@@ -145,19 +146,22 @@ def _checked(information: Floats, unknowns: Sequence[InformationColumn], loosest
 
 
 def _sparse(free: Floats) -> Iterator[Floats]:
-    """Yield a basis of the span of `free` (n, k), each vector with one unknown of its own, the first ones preferred."""
+    """Yield a sparse basis of the span of the columns of `free` (n, k).
+
+    Each vector has one unknown in which all following vectors are zero; earlier unknowns are preferred.
+    """
     left = free.T.copy()
     while len(left):
         size = np.linalg.norm(left, axis=0)
         column = int(np.argmax(size > 0.5 * size.max()))
-        # The vector of the span with the largest part in that unknown; the rest is turned to have none.
+        # Rotate the basis: the first vector gets all of this unknown, the others get none.
         turned = np.linalg.svd(left[:, [column]], full_matrices=True)[0].T @ left
         yield turned[0]
         left = turned[1:]
 
 
 def _in_words(direction: Floats, unknowns: Sequence[InformationColumn]) -> str:
-    """Return what moves together: "all delays together with all positions" and the like."""
+    """Return a free direction in words, such as "all delays together with all positions"."""
     named = np.abs(direction) > TAKES_PART * np.abs(direction).max()
     return " with ".join(
         _of_kind(kind, direction, named, unknowns)
@@ -166,7 +170,7 @@ def _in_words(direction: Floats, unknowns: Sequence[InformationColumn]) -> str:
 
 
 def _of_kind(kind: str, direction: Floats, named: Bools, unknowns: Sequence[InformationColumn]) -> str:
-    """Return the part of one kind: all, or which, and which grow as others shrink."""
+    """Return the unknowns of one kind in a direction, in words; "against" separates those with opposite signs."""
     everyone = [k for k, unknown in enumerate(unknowns) if unknown.kind == kind]
     moving = [k for k in everyone if named[k]]
     names = list(dict.fromkeys(unknowns[k].of for k in moving))

@@ -1,8 +1,9 @@
 """A calibration within a filter or smoother: corrected ranges as measurements, and delays as states.
 
-Ranges are direct, reflected or outliers. An update follows from the mean and variance of the noise in an innovation
-(moments of the posterior for Gaussian noise and state), by a gate or by a mixture of errors. The filters of
-`calib.evaluation` use these functions; `RangeUpdate` offers them to other filters, `calib.factors` to smoothers.
+Ranges are direct, reflected or outliers. An innovation contains Gaussian noise, and a detour if the range is reflected.
+A gate, or a mixture of these three kinds of errors, gives the posterior mean and variance of the noise, which determine
+the update (docs/theory.md). The filters of `calib.evaluation` use these functions. `RangeUpdate` provides them for
+other filters, `calib.factors` for smoothers.
 """
 
 from __future__ import annotations
@@ -27,13 +28,16 @@ __all__ = ["DelayStates", "RangeUpdate"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeErrors:
-    """The error model of a range: reflected with probability `share`, by a least detour and an exponential one.
+    """The error model of ranges, in metres and shares of 1.
 
-    Metres and shares of 1. Outliers have the share `outlier` and a size of about `outlier_m`. Of several ranges,
-    `share` and `detour_m` are columns (n,), or (n, 2) of differences of arrival, which reflections of the one reception
-    lengthen and of the other shorten. `detour_m` is the mean of both kinds of exponential detour, `long` their
-    proportions, `location_m` the centre of the noise of a range. Of the `share`, `known` is that of reflections that
-    lengthened the range before by the same detour, and say no more of the distance.
+    A range is reflected with the probability `share`; its detour is `least_m` plus an exponential part with the mean
+    `detour_m`, of the two kinds that `long` describes. It is an outlier with the probability `outlier`; outliers have
+    the standard deviation `outlier_m`. `location_m` is the centre of the noise. For several ranges, `share` and
+    `detour_m` are arrays (n,); for differences of arrival (n, 2): a reflection of the first reception lengthens the
+    difference, one of the second shortens it.
+
+    `known` is the part of `share` whose reflection and detour already lengthened the previous range of the pair. The
+    filter has absorbed this detour, so the range gives no new information on the distance.
     """
 
     share: Floats | float
@@ -46,15 +50,16 @@ class RangeErrors:
     known: Floats | float = 0.0
 
     def at(self, rows: Any) -> RangeErrors:
-        """Return the model of some of several ranges, or of one."""
+        """Return the model of the ranges in `rows` (an index of NumPy)."""
         return replace(self, share=np.asarray(self.share)[rows], detour_m=np.asarray(self.detour_m)[rows])
 
 
 def range_errors(calibration: Calibration, ranges: Ranges) -> tuple[Floats, RangeErrors]:
-    """Return the noise (n,) of corrected ranges within a flight, and their errors.
+    """Return the noise (n,) of corrected ranges within a flight, in metres, and their error model.
 
-    Outliers have a share of a thousandth at least, of about 3 m, because a filter meets errors that the calibration did
-    not. Without an error model a tenth of the ranges is taken to be reflected, by 30 cm on average.
+    Outliers have a share of at least 0.001 and a standard deviation of at least 3 m, because a filter meets errors that
+    the recording of the calibration does not contain. Without an error model, a tenth of the ranges is assumed to be
+    reflected, by 30 cm on average (judgements).
     """
     model, lifted = calibration.errors, calibration.lifted(ranges)
     if model is None:
@@ -76,10 +81,11 @@ def range_errors(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Rang
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeighedInnovation:
-    """An update by a range: mean and variance of the noise in the innovation, and whether the range is accepted.
+    """Posterior mean and variance of the noise in an innovation, and whether the range is accepted (`believed`).
 
-    `log_density` is that of the innovation, in 1/m; `nis` is its square over its variance with plain noise; `tail` is
-    the probability that the range was not direct. `reflected` (..., sides) are probabilities of a reflection.
+    `log_density` is the logarithm of the density of the innovation (1/m). `nis` is the square of the innovation over
+    its variance (normalised innovation squared). `tail` is the probability that the range is not direct. `reflected`
+    (..., sides) are the probabilities of a reflection of each reception.
     """
 
     noise_m: Floats
@@ -94,7 +100,7 @@ class WeighedInnovation:
 def gated_update(innovation_m: Floats, variance_m2: Floats, gate: float) -> WeighedInnovation:
     """Accept an innovation if its square over its variance is below the gate; otherwise the state does not change.
 
-    What is not accepted has the density at the gate.
+    A rejected innovation has the density of one at the gate.
     """
     believed = innovation_m**2 < gate * variance_m2
     return WeighedInnovation(
@@ -109,11 +115,12 @@ def gated_update(innovation_m: Floats, variance_m2: Floats, gate: float) -> Weig
 
 
 def mixture_update(innovation_m: Floats, variance_m2: Floats, errors: RangeErrors) -> WeighedInnovation:
-    """Weigh direct, reflected and outlying ranges by the likelihood of the innovation.
+    """Return the posterior moments of the noise if a range is direct, reflected or an outlier.
 
-    Of several ranges shares and detours are (n, sides). The noise in a reflected range is a normal distribution,
-    truncated above (`calib.range_errors.densities`, docs/theory.md); in a difference of arrival that reads short,
-    truncated below. An outlier has no information.
+    For several ranges, shares and detours are (n, sides). The noise in a reflected range has a truncated normal
+    distribution: truncated above if the reflection lengthens the measurement (`calib.range_errors.densities`,
+    docs/theory.md), below if it shortens it (second side of a difference of arrival). An outlier has no information:
+    its noise keeps mean 0 and variance `variance_m2`.
     """
     sigma_m, inside = np.sqrt(variance_m2), 1 - errors.outlier
     shares, detours_m = np.atleast_1d(errors.share, errors.detour_m)
@@ -128,6 +135,7 @@ def mixture_update(innovation_m: Floats, variance_m2: Floats, errors: RangeError
         share, old, detour_m = shares[..., side], known[..., side], detours_m[..., side]
         found = densities(sign * innovation_m, sigma_m, errors.least_m, detour_m, errors.long)
         each = found.reflected * (inside * (1 - direct) / any_share)
+        # A known reflection (`old`) lengthens the range as before: its noise keeps its prior moments.
         noise, new = sign * found.noise_m(), each * (share - old)
         tails.append(each * share)
         total, mean = total + tails[-1], mean + new * noise
@@ -145,25 +153,27 @@ def mixture_update(innovation_m: Floats, variance_m2: Floats, errors: RangeError
 
 
 class Reflections:
-    """Which pairs of tags are reflected, as filters (...) come to know: a renewal process of each pair.
+    """Probabilities that pairs of tags are reflected now, for filters (...), by a renewal process of each pair.
 
-    After `renewal_s` on average it is drawn anew whether ranges of a pair are reflected, and by what detour.
+    A pair keeps its reflection, or the direct path, for an exponential time with the mean `renewal_s`. Then reflection
+    and detour are drawn again.
     """
 
     def __init__(self, renewal_s: float, shape: tuple[int, ...]) -> None:
-        """Begin with nothing known of filters and pairs (..., pairs)."""
+        """Take the shape (..., pairs) of filters and pairs."""
+        # Probabilities that the last reflection (0) or the last direct path (1) of a pair still lasts.
         self.renewal_s, self.lasting = renewal_s, np.zeros((*shape, 2))
 
     def decay(self, dt: float) -> None:
-        """Let `dt` seconds pass."""
+        """Predict the probabilities `dt` seconds later."""
         self.lasting *= math.exp(-dt / self.renewal_s) if self.renewal_s else 0.0
 
     def weigh(
         self, innovation_m: Floats, variance_m2: Floats, errors: RangeErrors, pair: Ints, used: Bools
     ) -> WeighedInnovation:
-        """Return the `mixture_update` by what is known of the pairs (sides,) in a measurement.
+        """Return the `mixture_update` with the present probabilities of the pairs (sides,) of a measurement.
 
-        Filters (...) that have `used` it learn from it.
+        Then update the probabilities of the filters (...) in the mask `used`.
         """
         sides = pair[: np.count_nonzero(errors.share)]
         before = self.lasting[..., sides, :]
@@ -177,11 +187,11 @@ class Reflections:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DelayStates:
-    """Changes of antenna delays since a calibration, as states of a filter: metres that light travels in them.
+    """Changes of antenna delays since a calibration, as states of a filter, in metres (times the speed of light).
 
-    A range depends on half of two of them. They begin at zero with `covariance_m2` (tags, tags) and are random walks of
-    `walk_m` in a root of a second. `delays_ns` and `std_ns` (tags,) are those of the calibration; what that does not
-    determine stays undetermined, because no range depends on it.
+    A range depends on half of the changes of its two tags. The states start at zero with `covariance_m2` (tags, tags)
+    and are random walks with a standard deviation of `walk_m` after one second. `delays_ns` and `std_ns` (tags,) are
+    those of the calibration. Combinations of delays that the calibration does not determine stay undetermined.
     """
 
     tags: tuple[int, ...] = ()
@@ -193,12 +203,11 @@ class DelayStates:
 
     @classmethod
     def of(cls, calibration: Calibration, tags: Sequence[int], *, walk_m: float = 0.005) -> DelayStates:
-        """Return those of some tags.
+        """Return the states of some tags, with the covariance of the calibration.
 
-        The covariance is that of the calibration. With the default walk the errors of filters are as large as they say
-        where ranges of one tag or of two drift by 2 cm/K over 10 K in two minutes (`benchmarks/dependences.py`), and
-        those of all others by 2.15 mm/K (DW1000 user manual, section 8.3.1). Raises `BadInputError` for a calibration
-        without delays of single tags.
+        The default of `walk_m` was chosen by simulation (`benchmarks/dependences.py`): filters are consistent if ranges
+        of one or two tags drift by 2 cm/K over 10 K in two minutes, and those of all others by 2.15 mm/K (DW1000 user
+        manual, section 8.3.1). Raises `BadInputError` for a calibration with constants of pairs.
         """
         if calibration.pair_offsets:
             raise BadInputError("the calibration has constants of pairs instead of delays; fit it with `constants` tag")
@@ -212,15 +221,18 @@ class DelayStates:
         )
 
     def slopes(self, ends: Ints, slopes: Floats) -> Floats:
-        """Return derivatives of ranges by these states (n, tags), from those by the delays of both `ends` (n, 2)."""
+        """Return derivatives of ranges by these states (n, tags), given `slopes` (n, 2) by the delays of `ends`
+        (n, 2).
+        """
         return np.asarray(np.einsum("ne,net->nt", slopes, ends[..., None] == np.array(self.tags, dtype=np.int64)))
 
     def estimates(
         self, change_m: Floats | float = 0.0, covariance_m2: Floats | None = None
     ) -> dict[int, tuple[float, float]]:
-        """Return delays in ns and their standard deviations by tag, infinite where undetermined.
+        """Return the delay of each tag in ns and its standard deviation, which is infinite if undetermined.
 
-        Without arguments they are those of the calibration.
+        `change_m` (tags,) and `covariance_m2` (tags, tags) are the present states of a filter; by default those of the
+        calibration.
         """
         known = self.covariance_m2 if covariance_m2 is None else covariance_m2
         metres_a_ns = 1e-9 * self.speed_of_light
@@ -238,7 +250,8 @@ class RangeUpdate:
     """Corrected ranges (n,) as measurements of any filter or smoother.
 
     A range `measured_m` is the distance of two antennas, plus `delay_slopes` (n, 2) times the changes of the delays of
-    both `ends` (n, 2) in metres (`DelayStates`), plus an error: noise of `noise_m`, and what `errors` says.
+    both `ends` (n, 2) in metres (`DelayStates`), plus noise with the standard deviation `noise_m`, plus the detour of a
+    reflection or an outlier by the model `errors`.
 
     >>> import calib, numpy as np
     >>> from calib.online import RangeUpdate
@@ -258,8 +271,11 @@ class RangeUpdate:
 
     @classmethod
     def of(cls, calibration: Calibration, ranges: Ranges) -> RangeUpdate:
-        """Return ranges as measurements; raises what `Calibration.apply` raises, and `BadInputError` without a power
-        where the calibration needs one."""
+        """Return ranges as measurements.
+
+        Raises the errors of `Calibration.apply`, and `BadInputError` for a range without power if the calibration
+        needs one.
+        """
         noise, known = range_errors(calibration, ranges)
         errors = replace(known, share=np.reshape(known.share, (-1, 1)), detour_m=np.reshape(known.detour_m, (-1, 1)))
         measured_m = calibration.apply(ranges).corrected_m - errors.location_m
@@ -271,11 +287,12 @@ class RangeUpdate:
         )
 
     def innovation(self, first_m: Floats, second_m: Floats, changes_m: Floats | float = 0.0) -> tuple[Floats, Floats]:
-        """Return innovations (n,) and derivatives (n, 3) of the distances by the first antenna's place.
+        """Return innovations (n,) and the derivatives `along` (n, 3) of distances by the place of the first antenna.
 
-        Places are (n, 3) or (3,), of initiator and target, in metres; `changes_m` (n, 2) are those of their delays. The
-        derivative by the second place is the negative one, that by the delays `delay_slopes`; that by a rotation vector
-        of the first body, in its own axes, is arm x C' along, with its attitude C.
+        `first_m` and `second_m`, (n, 3) or (3,), are the places of the antennas of initiator and target in metres;
+        `changes_m` (n, 2) are the changes of their delays. Other derivatives of the expected range: by the second place
+        -`along`; by the changes of the delays `delay_slopes`; by a small rotation of the first body, as a vector in its
+        own axes, arm x (C' along), with the attitude C (body to world) and the lever arm in the body's axes.
         """
         apart = np.atleast_2d(first_m - second_m)
         distance = np.maximum(np.linalg.norm(apart, axis=-1), 1e-6)
@@ -283,10 +300,10 @@ class RangeUpdate:
         return self.measured_m - expected, apart / distance[:, None]
 
     def weigh(self, innovation_m: Floats, state_m2: Floats | float = 0.0) -> WeighedInnovation:
-        """Return what innovations (n,) say, where the state contributes a variance of `state_m2` to them.
+        """Return the posterior moments of the noise in innovations (n,), which drive the update of a filter.
 
-        With variance s^2 of an innovation, P h its covariance with the state, K = P h / s^2, and mean n and variance v
-        of its noise: the state moves by K n, and its covariance grows by K (v - s^2) K'.
+        `state_m2` is the variance h' P h that the state contributes. With s^2 = h' P h + `noise_m`^2, the gain
+        K = P h / s^2, and mean n and variance v of the noise: add K n to the state and K (v - s^2) K' to P.
         """
         return mixture_update(innovation_m, self.noise_m**2 + state_m2, self.errors)
 
@@ -297,8 +314,11 @@ class RangeUpdate:
 
     @cached_property
     def likeliest(self) -> tuple[Floats, WeighedInnovation]:
-        """The innovations (n,) with the largest likelihood, were the state exact, which reflections move up from zero;
-        and what they say."""
+        """The innovations (n,) with the largest likelihood if the state is exact, and their posterior moments.
+
+        They are 0 or larger, because reflections lengthen ranges. Bisection finds them: the derivative of the log
+        likelihood by the innovation is -n / s^2, with the mean n of the noise.
+        """
         low, high = -4 * self.noise_m, self.errors.least_m + 6 * self.noise_m
         for _ in range(50):
             middle = (low + high) / 2
@@ -307,30 +327,32 @@ class RangeUpdate:
         return low, self.weigh(low)
 
     def whiten(self, innovation_m: Floats) -> tuple[Floats, Floats]:
-        """Return residuals r (n,) of least squares and their derivatives (n,) by the innovation.
+        """Return residuals r (n,) for least squares and their derivatives (n,) by the innovation.
 
-        Half of r^2 is the logarithm of the largest likelihood over that of the innovation. Its slope n / s^2 follows
-        from the mean noise n (Tweedie's formula), and its curvature at the top from the variance of noise.
+        r^2 / 2 is the logarithm of the largest likelihood over the likelihood of the innovation. Its derivative is
+        n / s^2, with the mean n of the noise (Tweedie's formula), so r' = n / (s^2 r). At the maximum, where r = 0, r'
+        is the root of the curvature (s^2 - v) / s^4, with the variance v of the noise.
         """
         (likeliest_m, top), found = self.likeliest, self.weigh(innovation_m)
         away_m = innovation_m - likeliest_m
         residual = np.sign(away_m) * np.sqrt(2 * np.maximum(top.log_density - found.log_density, 0.0))
-        steepest = np.sqrt(np.maximum(self.noise_m**2 - top.variance_m2, 0.0)) / self.noise_m**2
+        top_slope = np.sqrt(np.maximum(self.noise_m**2 - top.variance_m2, 0.0)) / self.noise_m**2
         near = np.abs(away_m) < 1e-3 * self.noise_m
         slope = found.noise_m / np.where(near, 1.0, residual * self.noise_m**2)
-        return np.where(near, steepest * away_m, residual), np.where(near, steepest, slope)
+        return np.where(near, top_slope * away_m, residual), np.where(near, top_slope, slope)
 
 
 def ends_of(ranges: Ranges) -> Ints:
-    """Return the tags (n, 2) on whose delays ranges, and then their arrivals, depend."""
+    """Return the tags (n, 2) whose delays ranges contain: rows of the ranges, then rows of their arrivals."""
     ends, heard = np.column_stack([ranges.initiator, ranges.target]), ranges.arrivals
     return ends if heard is None else np.concatenate([ends, ends[heard.exchange]])
 
 
 def delay_slopes(ranges: Ranges) -> Floats:
-    """Return derivatives (n, 2) of corrected ranges, and then of their arrivals, by changes of those tags' delays.
+    """Return derivatives (n, 2) by the delays of `ends_of`, in metres per metre: of ranges, then of their arrivals.
 
-    A difference of arrival is corrected by the target's delay less those of the range (`Calibration.correct_arrivals`).
+    A corrected difference of arrival contains the target's delay minus the delays of the range
+    (`Calibration.correct_arrivals`).
     """
     slopes, heard = -np.column_stack([ranges.weight_initiator, ranges.weight_target]), ranges.arrivals
     return slopes if heard is None else np.concatenate([slopes, -slopes[heard.exchange] - (0.0, 1.0)])

@@ -1,4 +1,4 @@
-"""The pair of tags of each range, in either direction."""
+"""Numbers of the pairs of tags in ranges; both directions are one pair."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from uwblink.arrays import Ints
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """The pair of each range, `number` (n,), and the tags of every pair, the lower first: `ends` (pairs, 2)."""
+    """The pair of each range, `number` (n,), and the tags of each pair, `ends` (pairs, 2), the smaller id first."""
 
     number: Ints
     ends: Ints
@@ -23,7 +23,7 @@ class Pairs:
 
 
 def pairs_of(initiator: Ints, target: Ints) -> Pairs:
-    """Number the pairs of ranges (n,) in order of their lower tags, then of their higher ones."""
+    """Return the pairs of ranges (n,), numbered in order of their smaller id, then of their larger id."""
     low, high = np.minimum(initiator, target).astype(np.int64), np.maximum(initiator, target).astype(np.int64)
     codes, number = np.unique(low << 32 | high, return_inverse=True)
     return Pairs(number.astype(np.int32), np.column_stack([codes >> 32, codes & 0xFFFFFFFF]))

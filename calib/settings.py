@@ -1,4 +1,4 @@
-"""The settings of fits, for Python and for the command line, and their checks."""
+"""Settings of fits, for Python and the command line, and their checks."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NUMBERS: Final = {
     **dict.fromkeys(("start_std_m", "start_std_deg", "start_std_m_s", "rate_hz", "speed_m_s"), ABOVE_ZERO),
     "seeds": (1, 1000, "1 to 1000"),
 }
-"""The least and the largest value of settings that state no `bounds` themselves, and what is expected."""
+"""Smallest and largest value of settings without `bounds` in their metadata, and the expected value in words."""
 
 FIXED: Any = {
     "help": "Known delay of a tag, which is not fitted, such as 1=-0.36. May be repeated.",
@@ -51,7 +51,7 @@ FLIGHT_PANEL: Final = "Without known distances (--truth ranges)"
 
 
 def check_choice(parameter: str, value: str, allowed: Iterable[str]) -> None:
-    """Raise `BadInputError` that lists what is allowed."""
+    """Raise `BadInputError` that lists the allowed values if `value` is not one of them."""
     if value not in allowed:
         raise BadInputError(f"found {value!r}, allowed: {', '.join(allowed)}", parameter=parameter)
 
@@ -64,7 +64,7 @@ def check_tag(tag: object) -> None:
 
 def is_tag(value: object) -> bool:
     """Return whether a value can be the id of a tag."""
-    # Ids have 16 bits in recordings (`uwblink.twr.LARGEST_ID`, which would load NumPy for the help of commands).
+    # Ids have 16 bits in recordings. `uwblink.twr.LARGEST_ID` is not used: importing it loads NumPy, too slow for help.
     return isinstance(value, Integral) and not isinstance(value, bool) and 0 <= int(value) < 2**16
 
 
@@ -73,7 +73,7 @@ def _is_finite(value: object) -> bool:
 
 
 def read_scale(text: str) -> float | None:
-    """Return a scale in nanoseconds, None for "auto"; raises `BadInputError`."""
+    """Return a scale in nanoseconds from a text, None for "auto"; raises `BadInputError` for other words."""
     if text == "auto":
         return None
     try:
@@ -83,7 +83,7 @@ def read_scale(text: str) -> float | None:
 
 
 def read_fixed(texts: Iterable[str]) -> dict[int, float]:
-    """Return known delays in ns by tag from texts TAG=NS; raises `BadInputError`."""
+    """Return known delays in ns by tag, from texts TAG=NS; raises `BadInputError` for other texts and repeated tags."""
     fixed: dict[int, float] = {}
     for text in texts:
         tag, equals, value = text.partition("=")
@@ -100,9 +100,9 @@ def read_fixed(texts: Iterable[str]) -> dict[int, float]:
 
 
 def read_groups(path: Path) -> dict[str, Any]:
-    """Read a design file: a table `groups` that maps names to lists of tags, which `FitSettings` checks.
+    """Return the table `groups` of a TOML file, which maps names to lists of tags; `FitSettings` checks the lists.
 
-    Raises `BadInputError` for another file.
+    Raises `BadInputError` for a file with other content.
     """
     table = TomlReader(path, partial(BadInputError, parameter="groups")).table
     groups = table.get("groups")
@@ -113,12 +113,12 @@ def read_groups(path: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class CheckedSettings:
-    """Base of settings: checks them, and states those that differ from the defaults."""
+    """Base of settings: checks their values, and lists those that differ from the defaults."""
 
     def __post_init__(self) -> None:
-        """Check choices, numbers and known delays; a number may be None if it is by default.
+        """Check choices, numbers and known delays. A number may be None only if its default is None.
 
-        A choice whose default is None may have other values than its names, such as a registered loss.
+        If the default of a choice is None, other values than its names are accepted, such as a registered loss.
         """
         for one in fields(self):
             name, value, bounds = one.name, getattr(self, one.name), one.metadata.get("bounds")
@@ -145,7 +145,7 @@ class CheckedSettings:
 
 
 def _as_json(value: object) -> object:
-    """Return the value of a setting as a JSON value; an object becomes a word."""
+    """Return the value of a setting as a JSON value; objects are replaced by a description."""
     if isinstance(value, Mapping):
         return {str(key): _as_json(one) for key, one in value.items()}
     if isinstance(value, tuple):
@@ -161,9 +161,10 @@ class FitSettings(CheckedSettings):
     `loss` is "mixture", the likelihood of direct ranges, reflections and outliers with a share of reflections by pair,
     or a robust loss of residuals: "cauchy", "huber", "soft_l1", "l2", one that `register_loss` added; None chooses the
     mixture, and "cauchy" for a sequential fit and for one without a curve. `scale_ns` is the scale of a robust
-    loss in time of flight, None to estimate it. `between_m` is the standard deviation of the errors that are constant
-    for a pair in one recording and differ in the next; None estimates it from several recordings, or assumes 5 cm with
-    one (more if its eight parts differ by more). `lift` and `alpha_dbm` make the lifted power of an exchange.
+    loss in time of flight, None to estimate it. `between_m` is the standard deviation of errors that are constant for
+    a pair during a recording and differ between recordings; None estimates it from several recordings, and from one
+    recording assumes 5 cm, or more if its eighths differ by more. `lift` and `alpha_dbm` define the lifted power of an
+    exchange.
 
     `fixed_ns` are known delays by tag; `groups` are tags that share curves, by name (all do by default); `sequential`
     fits delays first and then the curve to the residuals (ICRA 2023, sections III and IV). The curve is zero at
@@ -345,7 +346,7 @@ class FitSettings(CheckedSettings):
 
 
 def read_distances(texts: Iterable[str]) -> tuple[KnownDistance, ...]:
-    """Return distances by a tape from texts TAG-TAG=METRES; raises `BadInputError`."""
+    """Return known distances from texts TAG-TAG=METRES[+-STD][@WHEN]; raises `BadInputError` for other texts."""
     from uwblink import KnownDistance
 
     number = r"\s*(\d+(?:\.\d*)?|\.\d+)\s*"
@@ -359,7 +360,7 @@ def read_distances(texts: Iterable[str]) -> tuple[KnownDistance, ...]:
                 parameter="distances",
             )
         first, second, distance, sigma, when = parts.groups()
-        # A tape between antennas is good to a centimetre.
+        # The default standard deviation is 1 cm, for a tape between antennas (a judgement).
         found.append(
             KnownDistance(int(first), int(second), float(distance), float(sigma or 0.01), (when or "").strip())
         )
@@ -368,7 +369,7 @@ def read_distances(texts: Iterable[str]) -> tuple[KnownDistance, ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightSettings(CheckedSettings):
-    """Settings of `fit_from_ranges`, which explains them: known facts about a flight without true distances.
+    """Settings of `fit_from_ranges`, known facts about a flight without true distances; that function explains them.
 
     Raises `BadInputError` that names the setting.
 

@@ -1,4 +1,4 @@
-"""Robust spread of values, all together or by groups, and the factor of 95 % intervals."""
+"""Robust standard deviations of values, of all or by group, and the factor of 95 % intervals."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ __all__ = [
 ]
 
 TWO_SIDED_95: Final = 1.959963984540054
-"""Standard deviations about the mean that contain 95 % of a normal distribution."""
+"""97.5 % quantile of the standard normal distribution: half of a 95 % interval, in standard deviations."""
 
 SIGMA_OF_MAD: Final = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
+"""Ratio of the standard deviation of a normal distribution to its median absolute deviation."""
 
 STD_OF_MEDIAN: Final = 1.2533
-"""Standard error of a median over that of a mean, of normal values: the root of pi/2."""
+"""Ratio of the standard errors of the median and of the mean of many normal values: the root of pi/2."""
 
 
 def radius_95(covariance: Floats) -> float:
@@ -41,24 +41,27 @@ def radius_95(covariance: Floats) -> float:
 
 
 def robust_spread(values: Floats, centre: float | None = None) -> float:
-    """Return 1.4826 times the median absolute deviation of values (n,): their standard deviation, were they normal.
+    """Return 1.4826 times the median absolute deviation of values (n,), the standard deviation of normal values.
 
-    Deviations are from the median, unless another `centre` is known.
+    Deviations are from `centre`, by default the median.
     """
     middle = np.median(values) if centre is None else centre
     return SIGMA_OF_MAD * float(np.median(np.abs(values - middle)))
 
 
 def medians(values: Floats, group: Ints) -> Floats:
-    """Return the median of the values (n,) of each group (k,), by the numbers of groups (n,), which all have some."""
+    """Return the median of the values (n,) in each group (k,).
+
+    `group` (n,) is the number of each value's group, from 0; no group may be empty.
+    """
     return np.asarray(ndimage.median(values, group, np.arange(group.max() + 1))) if len(values) else np.zeros(0)
 
 
 def less_medians(values: Floats, group: Ints) -> Floats:
-    """Return values (n,) less the median of their group (n,)."""
+    """Return values (n,) minus the median of their `group` (n,)."""
     return np.asarray(values - medians(values, group)[group])
 
 
 def spreads(values: Floats, group: Ints) -> Floats:
-    """Return the robust spread of the values (n,) of each group (k,)."""
+    """Return the robust standard deviation of the values (n,) in each group (k,)."""
     return SIGMA_OF_MAD * medians(np.abs(less_medians(values, group)), group)

@@ -33,8 +33,9 @@ class CorrectedRanges(ColumnTable):
     error, and `outlier` marks errors that are neither noise nor a reflection; otherwise `tail_probability` equals
     `tail_share`, and `outlier` is False. `clamped` marks lifted powers outside the fitted ones, where the curves are
     held constant; there `sigma_total_m` includes the slope of the curve at its end. It also includes the effect of
-    unknown directions and temperatures. All but `sigma_m` and `clamped` are NaN if the calibration has no error model
-    (`Calibration.errors`) or the range has no power.
+    unknown directions and temperatures. These expected errors (`sigma_total_m` to `tail_probability`) are NaN if the
+    calibration has no error model (`Calibration.errors`). If a range has no power and the calibration needs it, all but
+    `raw_m`, `delay_corrected_m` and the flags are NaN.
 
     >>> import calib
     >>> flight = calib.load_ranges(calib.sample_flight())
@@ -101,7 +102,7 @@ class CorrectedRange(NamedTuple, Generic[Value]):
 
 
 def corrected_ranges(calibration: Calibration, ranges: Ranges) -> CorrectedRanges:
-    """Correct ranges: the function behind `Calibration.apply`, with the same result and errors."""
+    """Correct ranges; `Calibration.apply` calls this function and describes result and errors."""
     delays = _without_delays(calibration, ranges)
     lifted = calibration.lifted(ranges)
     longer, unknown = dependences_m(calibration, ranges)
@@ -113,13 +114,13 @@ def corrected_ranges(calibration: Calibration, ranges: Ranges) -> CorrectedRange
         corrected_m=corrected,
         sigma_m=noise_m(calibration, ranges),
         lifted=lifted,
-        clamped=~calibration.bias_curve.inside(lifted),
+        clamped=np.isfinite(lifted) & ~calibration.bias_curve.inside(lifted),
         **_errors(calibration, ranges, lifted, corrected - ranges.truth_m, unknown),
     )
 
 
 def corrected_arrivals(calibration: Calibration, ranges: Ranges) -> CorrectedArrivals:
-    """Correct differences of arrival: the function behind `Calibration.correct_arrivals`, with the same result and
+    """Correct differences of arrival; `Calibration.correct_arrivals` calls this function and describes result and
     errors.
     """
     heard, receptions = arrivals_in(ranges), heard_receptions(ranges)
@@ -140,7 +141,7 @@ def corrected_arrivals(calibration: Calibration, ranges: Ranges) -> CorrectedArr
     applied = corrected_ranges(calibration, exchange)
     delay_ns = np.array([calibration.delays_ns[tag] for tag in exchange.target.tolist()])
     late_m = 1e-9 * calibration.speed_of_light * delay_ns - reception_bias_m(calibration, receptions)
-    # A range contains half of each delay; a difference of arrival contains the whole delay of the target only.
+    # A range contains half of the target's delay, a difference of arrival the whole delay: hence the factor of 2.
     of_target = replace(exchange, temperature_c=np.where([False, True], exchange.temperature_c, np.float32(np.nan)))
     late_m -= 2 * dependences_m(calibration, of_target)[0]
     sigma, model = np.column_stack([noise_m(calibration, one) for one in receptions[:2]]), calibration.errors
@@ -159,16 +160,16 @@ def corrected_arrivals(calibration: Calibration, ranges: Ranges) -> CorrectedArr
 
 
 def arrivals_in(ranges: Ranges) -> Arrivals:
-    """Return the differences of arrival of ranges; raises `BadInputError` if nothing was overheard."""
+    """Return the differences of arrival of ranges; raises `BadInputError` if there are none."""
     if ranges.arrivals is None:
         raise BadInputError(f"{ranges.source}: no differences of arrival, because no tag overheard these ranges")
     return ranges.arrivals
 
 
 def heard_receptions(ranges: Ranges) -> tuple[Ranges, Ranges, Ranges]:
-    """Return the receptions in differences of arrival (n,) as ranges with the power of one reception.
+    """Return the receptions that differences of arrival (n,) contain, as ranges with the power of the reception.
 
-    They are those of the response and of the poll at the listener, and of the poll at the target.
+    They are the response at the listener, the poll at the listener, and the poll at the target.
     """
     heard = arrivals_in(ranges)
     initiator, target, listener = ranges.initiator[heard.exchange], ranges.target[heard.exchange], heard.listener
@@ -185,19 +186,18 @@ def heard_receptions(ranges: Ranges) -> tuple[Ranges, Ranges, Ranges]:
 
 
 def reception_bias_m(calibration: Calibration, receptions: tuple[Ranges, Ranges, Ranges]) -> Floats:
-    """Return the bias (n,) of differences of arrival that follows from the bias of three receptions
-    (`heard_receptions`).
-    """
+    """Return the bias (n,) of differences of arrival, in metres, from the three receptions of `heard_receptions`."""
     response, poll, at_target = (_bias(calibration, one, calibration.lifted(one)) for one in receptions)
     return response - poll + at_target
 
 
 def reception_gains(heard: Arrivals) -> Floats:
-    """Return the variances of differences of arrival (n, 2) by response and poll, in variances of a range.
+    """Return the factors (n, 2) of the variance of a range in the variance of a difference: of response and of poll.
 
-    A range is the mean of two receptions, so that one has twice its variance. With clocks compared over a duration that
-    begins with one of them, its error counts 1 + s, and that of the reception at the end s (`Arrivals.stretch`): in the
-    range, too, which then has the variance (1 + (1 + s)^2 + s^2)/4 of a reception's.
+    A range is the mean of two receptions, so a reception has twice the variance of a range. If the clock rates are
+    compared over an interval that starts with one of the receptions, its error has the weight 1 + s, and the error of
+    the reception at the end of the interval the weight s (`Arrivals.stretch`). The same holds for the range, which then
+    has (1 + (1 + s)^2 + s^2)/4 of the variance of a reception.
     """
     twice = (1 + heard.stretch) ** 2 + heard.stretch**2
     gains = 4 / (1 + twice)[:, None] * np.column_stack([twice, np.ones_like(twice)])
@@ -205,7 +205,7 @@ def reception_gains(heard: Arrivals) -> Floats:
 
 
 def noise_m(calibration: Calibration, ranges: Ranges) -> Floats:
-    """Return the noise of direct ranges (n,) in metres, NaN without a power."""
+    """Return the standard deviation of direct ranges (n,) in metres, NaN if a power is needed and missing."""
     return _curve(calibration, ranges, calibration.lifted(ranges), "sigma_curve")
 
 
@@ -219,7 +219,7 @@ def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:
             f"{known}; fit one from a recording with all tags"
         )
     if not (good := determined(calibration, ranges)).all():
-        raise BadInputError(within_text(calibration, ranges, good))
+        raise BadInputError(undetermined_text(calibration, ranges, good))
     size = max(ranges.tags(), default=0) + 1
     delay_s = np.array([calibration.delays_ns.get(t, math.nan) for t in range(size)]) * 1e-9
     flight = ranges.weight_initiator * delay_s[ranges.initiator] + ranges.weight_target * delay_s[ranges.target]
@@ -227,8 +227,9 @@ def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:
 
 
 def determined(calibration: Calibration, ranges: Ranges) -> Bools:
-    """Return a mask (n,) of the ranges that a calibration can correct: their delays, or the sums of them, are
-    determined.
+    """Return a mask (n,) of the ranges that a calibration can correct.
+
+    The sum of both delays must be determined; for differences of arrival without stamps, their difference.
     """
     sides, pairs = calibration.sides, pairs_of(ranges.initiator, ranges.target)
     first, second = (
@@ -244,15 +245,13 @@ def keep_determined(calibration: Calibration, ranges: Ranges) -> Ranges:
     good = determined(calibration, ranges)
     if good.all() or not good.any():
         return ranges
-    text = f"{within_text(calibration, ranges, good)}; {np.count_nonzero(~good)} of {len(good)} ranges are left out"
-    warn(text, LeftOutWarning)
+    left_out = f"{np.count_nonzero(~good)} of {len(good)} ranges are left out"
+    warn(f"{undetermined_text(calibration, ranges, good)}; {left_out}", LeftOutWarning)
     return ranges[good]
 
 
-def within_text(calibration: Calibration, ranges: Ranges, good: Bools) -> str:
-    """Return a sentence that names the pairs whose ranges a calibration cannot correct: those not in the mask `good`
-    (n,).
-    """
+def undetermined_text(calibration: Calibration, ranges: Ranges, good: Bools) -> str:
+    """Return a sentence that names the pairs of the ranges that are not in the mask `good` (n,), with the reason."""
     names = first_few(pairs_of(ranges.initiator[~good], ranges.target[~good]).names)
     why = split_text(calibration.undetermined_splits)
     return f"{ranges.source}: the calibration cannot correct the ranges of {names}: {why}"
@@ -275,9 +274,10 @@ def _offsets_m(calibration: Calibration, ranges: Ranges) -> Floats:
 def _errors(
     calibration: Calibration, ranges: Ranges, lifted: Floats, error_m: Floats, unknown_m: Floats
 ) -> dict[str, Any]:
-    """Return the expected errors of ranges (n,), by the names of `CorrectedRanges`.
+    """Return the expected errors of ranges (n,), by the names of fields of `CorrectedRanges`.
 
-    `unknown_m` (n,) is the standard deviation that unknown directions and temperatures add.
+    `error_m` (n,) are the errors, NaN if unknown; `unknown_m` (n,) is the standard deviation by unknown directions and
+    temperatures.
     """
     model = calibration.errors
     if model is None:
@@ -285,22 +285,22 @@ def _errors(
         names = ("sigma_total_m", "mean_error_m", "tail_share", "tail_probability")
         return dict.fromkeys(names, nothing) | {"outlier": np.zeros(len(ranges), dtype=bool)}
     shapes = model.shapes(lifted, ranges.initiator, ranges.target, model.log_odds_of(ranges.features))
-    looked_at = np.isfinite(error_m)
-    tail, outlier = shapes.tail_share, looked_at
-    if looked_at.any():
-        tail, likely = model.tail_given(np.where(looked_at, error_m, 0.0), shapes)
-        outlier = looked_at & (likely > 0.5)
+    known = np.isfinite(error_m)
+    tail, outlier = shapes.tail_share, known
+    if known.any():
+        tail, outlier_probability = model.tail_given(np.where(known, error_m, 0.0), shapes)
+        outlier = known & (outlier_probability > 0.5)
     return {
         "sigma_total_m": np.hypot(np.hypot(model.total_m(shapes), calibration.bias_curve.beyond(lifted)), unknown_m),
         "mean_error_m": model.mean_m(shapes),
         "tail_share": shapes.tail_share,
-        "tail_probability": np.where(looked_at, tail, shapes.tail_share),
+        "tail_probability": np.where(known, tail, shapes.tail_share),
         "outlier": outlier,
     }
 
 
 def _bias(calibration: Calibration, ranges: Ranges, lifted: Floats) -> Floats:
-    """Return the bias of ranges (n,) in metres, at the power of the exchange or of each reception."""
+    """Return the bias of ranges (n,) in metres: the curve at the power of the exchange, or the mean over receptions."""
     if calibration.power_at == "exchange":
         return _curve(calibration, ranges, lifted, "bias_curve")
     first, second = (
@@ -313,7 +313,7 @@ def _bias(calibration: Calibration, ranges: Ranges, lifted: Floats) -> Floats:
 def _curve(
     calibration: Calibration, ranges: Ranges, lifted: Floats, name: Literal["bias_curve", "sigma_curve"]
 ) -> Floats:
-    """Return a curve at lifted powers (n,): if there are groups, the mean of the curves of both tags' groups."""
+    """Return a curve at lifted powers (n,), in metres; with groups, the mean of the curves of both tags' groups."""
     if not calibration.groups:
         return np.asarray(getattr(calibration, name)(lifted))
     member = {tag for group in calibration.groups.values() for tag in group.tags}
@@ -329,7 +329,7 @@ def _curve(
 
 
 def columns_of(applied: CorrectedRanges) -> CorrectedRange[Floats]:
-    """Return corrected ranges as columns; ranges without a power are corrected for delays only."""
+    """Return corrected ranges as `Calibration.correct` does: ranges without power are corrected for delays only."""
     powered = np.isfinite(applied.lifted)
     return CorrectedRange(
         np.where(powered, applied.corrected_m, applied.delay_corrected_m),

@@ -1,4 +1,4 @@
-"""Comparison of two calibrations: a test whether their delays agree within their standard errors."""
+"""Comparison of two calibrations: a chi-square test of the differences of their delays."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ from uwblink.ticks import SPEED_OF_LIGHT
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class CalibrationComparison:
-    """Differences of two calibrations, second minus first, without what other constants can compensate.
+    """Differences of two calibrations, second minus first.
 
-    A common shift of all delays has the same effect as a constant of the curve, so only their sum is compared:
-    `offset_m` is the additional correction of every range by the second calibration, at equal power. Shifts along
-    `undetermined_splits` are removed as well. If both have slopes over temperature or patterns over direction, delays
-    are compared at the reference temperature and in the average direction of the first. `pattern_rms_m` is the root
-    mean square of the difference of the patterns over all directions, and `pattern_probability` the probability of a
-    larger one by chance; NaN without patterns. `std_ns` is NaN for tags without a standard error in one of the
-    calibrations, such as published ones. `chi_square` has `degrees` of freedom; if there are none, nothing can be
-    tested, and `chi_square` and `probability` are NaN.
+    A common shift of all delays has the same effect as a constant of the curve, so it is removed from the delays, and
+    the sum of both effects is `offset_m`: the additional correction of every range by the second calibration, at equal
+    power. Shifts along `undetermined_splits` are removed as well. If both have slopes over temperature or patterns over
+    direction, delays are compared at the reference temperature and in the average direction of the first.
+    `curve_rms_m` is the standard deviation of the difference of both bias curves. `pattern_rms_m` is the root mean
+    square of the difference of the patterns over all directions, and `pattern_probability` the probability of a larger
+    one by chance; both are NaN without patterns. `std_ns` is NaN for tags without a standard error in one of the
+    calibrations, such as published ones. `chi_square` has `degrees` of freedom; without any, `chi_square` and
+    `probability` are NaN. `only_first` and `only_second` are tags that were not compared.
     """
 
     difference_ns: dict[int, float]
@@ -59,7 +60,7 @@ class CalibrationComparison:
         return self.table()
 
     def table(self, first: str = "the first", second: str = "the second") -> str:
-        """Return a line a tag in ns, the common shift in cm, and the verdict; `first` and `second` name the two."""
+        """Return a line per tag in ns, the common offset in cm, and the verdict; `first` and `second` are names."""
         lines = [
             f"  tag {tag:3d}  {difference:+.4f} ns  {interval(self.std_ns[tag])}"
             for tag, difference in self.difference_ns.items()
@@ -91,9 +92,9 @@ class CalibrationComparison:
 def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationComparison:
     """Test whether the delays of two calibrations differ by more than their standard errors explain, by chi-square.
 
-    Differences in ns are second minus first, without the shift common to all delays and shifts along undetermined
-    splits. Raises `UnanswerableError` if fewer than two tags have a determined delay in both, and if a tag has a
-    pattern over direction or a slope over temperature in only one of them.
+    Differences in ns are second minus first, without the common shift of all delays and shifts along undetermined
+    splits. Raises `UnanswerableError` if fewer than two tags have a determined delay in both, if one of them has
+    constants of pairs, and if a tag has a pattern over direction or a slope over temperature in only one of them.
 
     >>> import calib
     >>> first, second = (calib.fit(calib.sample_flight(seed=seed)).calibration for seed in (1, 2))
@@ -122,7 +123,7 @@ def compare(first: CalibrationSource, second: CalibrationSource) -> CalibrationC
     if len(stated) > 1:
         covariance = sum(c.covariance_ns2(stated) for c in both) + 1e-12 * np.eye(len(stated))
         covariance = covariance + moved_ns2[np.ix_(rows, rows)]
-    # Subtract the most likely shifts; the rank of the residuals' covariance drops by their number.
+    # Subtract the weighted least-squares estimate of the shifts; each takes one degree of freedom.
     precision = np.linalg.inv(covariance)
     of_loose = np.linalg.pinv(loose[rows].T @ precision @ loose[rows], hermitian=True)
     taken = of_loose @ loose[rows].T @ precision @ delta[rows]
@@ -157,28 +158,27 @@ DEPENDENCES: Final = {
     "patterns": ("pattern over direction", "directions", "pattern"),
     "temperatures": ("slope over temperature", "temperatures", "temperature"),
 }
-"""Dependences of delays, by the field of a calibration: the name, what the delays refer to, and the setting of the
-fit."""
+"""Name, plural of the reference, and setting of the fit of each dependence of delays, by the field of a calibration."""
 
 
 def _reference_shift(first: Calibration, second: Calibration, tags: list[int], name: str) -> tuple[Floats, Floats]:
-    """Return the change of delays (tags,) from the reference of the first calibration to that of the second.
+    """Return the change of delays (tags,) from the reference of the first calibration to that of the second, in ns.
 
-    The reference is the average direction or the reference temperature. Values are in ns, with their covariance. Raises
-    `UnanswerableError` if a tag has a dependence in only one of them.
+    The reference is the average direction or the reference temperature. The second value is the covariance (tags, tags)
+    of the changes. Raises `UnanswerableError` if a tag has the dependence in only one calibration.
     """
     centres = {tag: one.centre for one in getattr(first, name) for tag in one.tags}
     later = {tag for one in getattr(second, name) for tag in one.tags}
-    if lone := [tag for tag in tags if (tag in centres) != (tag in later)]:
+    if unlike := [tag for tag in tags if (tag in centres) != (tag in later)]:
         what, where, setting = DEPENDENCES[name]
         raise UnanswerableError(
-            f"tags {first_few(map(str, lone))} have a {what} in only one of the calibrations, so their delays refer "
+            f"tags {first_few(map(str, unlike))} have a {what} in only one of the calibrations, so their delays refer "
             f"to different {where}; fit both with the same `{setting}`"
         )
     moved_ns, moved_ns2 = np.zeros(len(tags)), np.zeros((len(tags),) * 2)
     for one in getattr(second, name):
         own = np.isin(tags, one.tags)[:, None]
-        # A range has half of a delay, with the other sign.
+        # A delay d changes a range by -c d / 2, so a change of a range by x is one of the delay by -2 x / c.
         away = 2e9 / SPEED_OF_LIGHT * own * (np.array([centres.get(t, one.centre) for t in tags]) - one.centre)
         moved_ns = moved_ns + away @ np.array(one.coefficients_m)
         moved_ns2 = moved_ns2 + away @ np.array(one.covariance_m2) @ away.T
@@ -204,7 +204,7 @@ def _apart(first: Calibration, second: Calibration, tags: list[int]) -> dict[str
 
 
 def loose_shifts(calibrations: Iterable[Calibration], tags: list[int]) -> Floats:
-    """Return the shifts of delays (tags, k) that are not compared: of all delays, and along each undetermined split."""
+    """Return the shifts of delays (tags, k) that are removed before a comparison: of all tags, and along each split."""
     splits = [sides for calibration in calibrations for sides in calibration.undetermined_splits]
     along = [np.isin(tags, first) * 1.0 - np.isin(tags, second) for first, second in splits]
     return np.column_stack([np.ones(len(tags)), *along])

@@ -1,4 +1,4 @@
-"""Corrected copies of recordings, as recordings or in other formats, and correction of exchanges as they arrive."""
+"""Corrected copies of recordings, as recordings or in other formats, and the correction of live exchanges."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.calibration.applying import CorrectedRanges, columns_of, determined, within_text
+from calib.calibration.applying import CorrectedRanges, columns_of, determined, undetermined_text
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration, load_calibration
 from calib.calibration.patterns import lack_direction, warn_of_directions
 from calib.data.arrivals import arrivals_of
@@ -31,9 +31,9 @@ from uwblink.twr import Exchanges
 
 @dataclass(frozen=True, slots=True)
 class Applied:
-    """Counts of corrected ranges: all, those at powers outside the fitted powers, and those without power.
+    """Counts of corrected ranges: all, those with powers outside the fitted ones, and those without power.
 
-    If the calibration has curves, a range without power is corrected for delays only, and has no sigma.
+    If the calibration needs power, a range without it is corrected for delays only, and its sigma is NaN.
     """
 
     count: int
@@ -51,11 +51,12 @@ def apply(
 ) -> Applied:
     """Write a copy of a recording with corrected `range_m` of every exchange; all other data stay the same.
 
-    The table `corrected` has the raw range of each exchange, its standard deviation and its flags. `to` writes a
-    folder in a form of `uwblink.exporters` instead ("csv", "parquet", "mcap", "rosbag2"). Stamps stay as they were
-    recorded. An exchange without any power is corrected for delays only. Exchanges of pairs that the calibration cannot
-    correct are left out, with a `LeftOutWarning`. Raises `BadInputError` for a recording that is corrected already, and
-    what `Recording.open`, `check_output` and `export_recording` raise.
+    The table `corrected` has the raw range of each exchange, its expected errors and its flags. With `to`, the output
+    is a folder in a format of `uwblink.exporters` ("csv", "parquet", "mcap", "rosbag2"). Stamps are not changed. An
+    exchange without any power is corrected for delays only. Exchanges of pairs that the calibration cannot correct are
+    left out, with a `LeftOutWarning`. Raises `BadInputError` for a recording that is corrected already and for one with
+    differences of arrival only, and the errors of `Calibration.apply`, `Recording.open`, `check_output` and
+    `export_recording`.
 
     >>> import calib, tempfile
     >>> from uwblink import Recording
@@ -91,9 +92,9 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
                 f"receptions corrects them itself"
             )
         warm, first = recording.columns("temperature"), 0
-        told = calibration.errors.features if calibration.errors else {}
-        # A response may belong to an exchange of the block before.
-        features = features_of(recording.exchanges(), RecordedSource(recording)) if told else None
+        slopes = calibration.errors.features if calibration.errors else {}
+        # Not block by block: an impulse response may belong to an exchange of the block before.
+        features = features_of(recording.exchanges(), RecordedSource(recording)) if slopes else None
         # Counts of corrected ranges: all, clamped, without power, without a direction.
         tags, counts, left_out, why = recording.tags(), np.zeros(4, dtype=np.int64), 0, ""
         meta = {"calibration": calibration.provenance}
@@ -107,7 +108,8 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
                 first += len(exchanges)
                 good = determined(calibration, ranges)
                 if not good.all():
-                    left_out, why = left_out + int(np.count_nonzero(~good)), within_text(calibration, ranges, good)
+                    left_out += int(np.count_nonzero(~good))
+                    why = undetermined_text(calibration, ranges, good)
                 if good.any():
                     lacking = int(np.count_nonzero(lack_direction(calibration, ranges[good])))
                     counts += (*_append(written, exchanges[good], calibration.apply(ranges[good])), lacking)
@@ -123,7 +125,9 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
 
 
 def _append(written: Recording, exchanges: Exchanges, applied: CorrectedRanges) -> tuple[int, int, int]:
-    """Add corrected exchanges; returns their number, and the numbers of clamped ones and of those without power."""
+    """Add corrected exchanges; return the numbers of all, of those outside the fitted powers, and of those without
+    power.
+    """
     powered = np.isfinite(applied.lifted)
     numbers = ("sigma_m", "sigma_total_m", "mean_error_m", "tail_share", "tail_probability")
     corrected_m = np.where(powered, applied.corrected_m, applied.delay_corrected_m)
@@ -140,15 +144,15 @@ def _append(written: Recording, exchanges: Exchanges, applied: CorrectedRanges) 
     with written.transaction():
         written.append_exchanges(replace(exchanges, range_m=corrected_m))
         written.append("corrected", table)
-    return len(exchanges), int(np.count_nonzero(applied.clamped & powered)), int(np.count_nonzero(~powered))
+    return len(exchanges), int(np.count_nonzero(applied.clamped)), int(np.count_nonzero(~powered))
 
 
 def live_correction(path: Path) -> Correction:
-    """Return the correction of arriving exchanges and overheard frames by the calibration in a file.
+    """Return the correction of live exchanges and overheard frames by the calibration in a file.
 
-    Columns are `corrected_m` and the other fields of `CorrectedRange`, with the same numbers as `calib.apply`. The
+    Its columns are `corrected_m` and the other fields of `CorrectedRange`, with the same values as `calib.apply`. The
     correction raises the errors of `Calibration.apply` and `Calibration.correct_arrivals`, for example for a tag
-    without a delay. Raises what `load_calibration` raises.
+    without a delay. Raises the errors of `load_calibration`.
     """
     calibration = load_calibration(path)
 
@@ -158,12 +162,12 @@ def live_correction(path: Path) -> Correction:
         return {"corrected_m": known.pop("range_m"), **known}
 
     def differences(exchanges: Exchanges, overheard: Columns) -> Columns:
-        ranges, nowhere = Ranges.from_exchanges(exchanges, source=str(path)), Contents(exchanges=exchanges).poses
-        heard = arrivals_of(exchanges, ranges.raw_m, overheard, nowhere, (), need_truth=False)
+        ranges, no_poses = Ranges.from_exchanges(exchanges, source=str(path)), Contents(exchanges=exchanges).poses
+        heard = arrivals_of(exchanges, ranges.raw_m, overheard, no_poses, (), need_truth=False)
         applied = calibration.correct_arrivals(replace(ranges, arrivals=heard))
         known = {name: getattr(exchanges, name)[heard.exchange] for name in ("time_ns", "initiator", "target")}
         known |= {"listener": heard.listener, "difference_m": applied.raw_m, "corrected_m": applied.corrected_m}
         return known | {"sigma_m": applied.sigma_m, "shared_m": applied.shared_m}
 
-    # Patterns say nothing of overheard frames.
+    # A calibration with patterns cannot correct overheard frames (`Calibration.correct_arrivals`).
     return Correction(correct, None if calibration.patterns else differences, calibration.antenna_delays)

@@ -195,8 +195,8 @@ CALIBRATION_KEYS: Final = (
 
 
 def number(least: float, most: float, what: str, kind: Callable[[float], Any] = float) -> PlainValidator:
-    """Return the check of a number between two bounds; errors describe it by `what`; `int` accepts whole numbers
-    only.
+    """Return the check of a number between two bounds; `what` describes it in errors. The `kind` int allows whole
+    numbers only.
     """
 
     def good(value: Any) -> bool:
@@ -207,17 +207,17 @@ def number(least: float, most: float, what: str, kind: Callable[[float], Any] = 
 
 
 def one_of(allowed: Iterable[str]) -> PlainValidator:
-    """Return the check of a word against the allowed ones."""
+    """Return the check that a text is one of the allowed ones."""
     return expect(f"one of {', '.join(allowed)}", lambda value: isinstance(value, str) and value in allowed)
 
 
 def expect(what: str, good: Callable[[Any], bool], kind: Callable[[Any], Any] = lambda value: value) -> PlainValidator:
-    """Return the check of a value by the function `good`; errors describe it by `what`; `kind` converts it."""
+    """Return the check of a value by the function `good`; `what` describes it in errors, `kind` converts it."""
     return PlainValidator(_checker(good, f"expected {what}", kind))
 
 
 def joint(good: Callable[[Any], bool], mistake: str) -> AfterValidator:
-    """Return the check that the fields of a dataclass agree; errors state the `mistake` after the key's name."""
+    """Return the check by `good` that the fields of a dataclass agree; `mistake` is the text of the error."""
     return AfterValidator(_checker(good, mistake))
 
 
@@ -233,7 +233,7 @@ def _checker(
 
 
 def is_tag_key(text: object) -> bool:
-    """Return whether a text is the id of a tag, as in keys of calibrations."""
+    """Return whether a text is the id of a tag, as a key of a calibration."""
     return isinstance(text, str) and text.isascii() and text.isdecimal() and len(text) < 9 and int(text) <= LARGEST_ID
 
 
@@ -244,19 +244,20 @@ def is_pair(text: object) -> bool:
 
 
 def ends_of(name: str) -> tuple[int, int]:
-    """Return the tags of a pair, the smaller id first, by its name."""
+    """Return the tags of a pair, the smaller id first, from its name, such as 1-2."""
     low, high = sorted(map(int, name.split("-")))
     return low, high
 
 
 def pair_name(pair: Sequence[int]) -> str:
-    """Return a pair as files and tables name it: 1-2."""
+    """Return the name of a pair in files and tables, such as 1-2."""
     return "-".join(map(str, pair))
 
 
 def known_of_splits(splits: Iterable[Split]) -> str:
-    """Return a sentence about what undetermined splits determine: ranges between two sides, or differences within
-    one.
+    """Return a sentence on the measurements that can be corrected in spite of undetermined splits.
+
+    They are ranges between the two sides of a split, or differences of arrival within one.
     """
 
     def named(tags: Sequence[int]) -> str:
@@ -272,7 +273,7 @@ def known_of_splits(splits: Iterable[Split]) -> str:
 
 
 def split_text(splits: Iterable[Split]) -> str:
-    """Return a sentence about what undetermined splits determine, and why."""
+    """Return `known_of_splits` with the reason."""
     splits = list(splits)
     why = (
         "delays of one side can increase by the amount by which those of the other decrease"
@@ -283,8 +284,8 @@ def split_text(splits: Iterable[Split]) -> str:
 
 
 MAX_DELAY_NS: Final = 1e4
-"""Largest delay: a register holds 1026 ns and a device has two; ten metres of cable are 50 ns. The rest is margin (3 km
-of range)."""
+"""Largest delay: 3 km of range. A register holds up to 1026 ns and a device has two of them; ten metres of cable are
+50 ns. The rest is margin."""
 
 # Squares and products of numbers up to 1e100 are finite.
 Number = Annotated[float, number(-1e100, 1e100, "a finite number up to 1e+100")]
@@ -333,10 +334,10 @@ IN_ORDER: Final = WrapSerializer(lambda table, write: write(dict(sorted(table.it
 def write(calibration: Value, adapter: TypeAdapter[Value]) -> str:
     """Return a calibration as JSON text.
 
-    The version states what a program must support to read the file: 2 with groups of tags, 3 with a curve that is taken
-    at each reception (taken at the mean power it is wrong by up to a decimetre), 4 with constants of pairs, 5 with
-    pairs that cannot be corrected, 6 with patterns over direction (without them ranges are wrong by up to a decimetre),
-    7 with slopes over temperature.
+    The version states the features that a program must support to read the file: 2 groups of tags; 3 a bias curve at
+    the power of each reception (at the mean power, corrections are wrong by up to a decimetre); 4 constants of pairs;
+    5 pairs that cannot be corrected; 6 patterns over direction (without them, ranges are wrong by up to a decimetre); 7
+    slopes over temperature.
     """
     table = adapter.dump_python(calibration, mode="json")
     # These keys are left out if they are empty; they are the last ones, in this order.
@@ -346,7 +347,7 @@ def write(calibration: Value, adapter: TypeAdapter[Value]) -> str:
     needed = ("groups", "power_at", "pair_offsets", "undetermined_splits", "patterns", "temperatures")
     version = max((number for number, key in enumerate(needed, 2) if key in used), default=1)
     text = json.dumps({"schema_version": version} | table | used, indent=1, allow_nan=False)
-    # Lists of numbers stand on one line each: a matrix reads as rows.
+    # Write each list of numbers on one line, so that a matrix appears as rows.
     on_lines = re.sub(
         r"\[[-+.e\d,\s]+\]", lambda found: " ".join(found[0].split()).replace("[ ", "[").replace(" ]", "]"), text
     )
@@ -365,7 +366,7 @@ def read(adapter: TypeAdapter[Value], text: str, where: str) -> Value:
         raise BadInputError(f"{where}: schema version {table['schema_version']!r}, this uwbcal reads 1 to 7")
     try:
         found = adapter.validate_python(table)
-        adapter.dump_python(found, mode="json")  # what is nested too deeply could not be written again
+        adapter.dump_python(found, mode="json")  # raises ValueError if it is nested too deeply to be written again
         return found
     except ValidationError as error:
         raise BadInputError(f"{where}: {_explained(error.errors(include_url=False))}") from None
@@ -374,7 +375,7 @@ def read(adapter: TypeAdapter[Value], text: str, where: str) -> Value:
 
 
 def _explained(errors: list[ErrorDetails]) -> str:
-    """Return the first mistake; wrong values come before missing keys."""
+    """Return the text of the first error; errors of values come before missing keys."""
     first = min(errors, key=lambda one: one["type"] == "missing")
     path = [str(part) for part in first["loc"]]
     message = "missing" if first["type"] == "missing" else first["msg"].removeprefix("Value error, ")
@@ -383,7 +384,7 @@ def _explained(errors: list[ErrorDetails]) -> str:
 
 
 def for_json(value: Any) -> Any:
-    """Return numbers and tables as JSON values, with None for numbers that are not finite."""
+    """Return a value for JSON, also within dictionaries: None for numbers that are not finite, keys as text."""
     if isinstance(value, dict):
         return {str(key): for_json(inner) for key, inner in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value

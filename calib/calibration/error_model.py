@@ -1,12 +1,13 @@
 """The error model of corrected ranges, by pair and power: direct ranges, reflections, outliers.
 
-An error is noise about `location_m`; with a probability of `tail_share` it also contains a detour, which is the sum of
-a shortest detour and an exponential one of two kinds; rarely it is an outlier. Noise and share are given at some lifted
-powers; the logarithm of the noise and the log odds of the share are interpolated linearly. Each pair has factors on
-noise, odds and detour; an unknown pair has the common values.
+An error is normal noise about `location_m`. With the probability `tail_share` the range is reflected, and the error
+also contains a detour: a constant, `least_m`, plus an exponential part of one of two kinds. With the probability
+`outlier_share` it is an outlier instead. Noise and share are given at some lifted powers; the logarithm of the noise
+and the log odds of the share are interpolated linearly. Each pair has factors on noise, odds and detour; a pair that
+was not fitted has the common values.
 
 Errors of a pair are not independent in time: short reflections, fading and power readings change slowly, so successive
-ranges share a part of their errors, and a filter that assumes independent ones is overconfident (`LastingErrors`).
+ranges share a part of their errors. A filter that assumes independent errors is overconfident (`LastingErrors`).
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ from calib.range_errors.densities import ROOT_2PI, LongDetours, densities
 from uwblink.arrays import Floats, Ints
 
 GATE: Final = 10.83
-"""99.9 % quantile of chi-square with one degree of freedom: filters take ranges whose squared errors are below it."""
+"""99.9 % quantile of chi-square with one degree of freedom. Filters accept innovations whose square over their variance
+is below it."""
 
 
 FeatureName = Annotated[str, one_of(FEATURES)]
@@ -52,9 +54,11 @@ LogOdds = Annotated[float, number(-50.0, 50.0, "a logarithm of odds, -50 to 50")
 
 @dataclass(frozen=True, slots=True)
 class LastingErrors:
-    """Errors of ranges within the gate of a filter, in units of sigma: mean, variance of the independent part, variance
-    of the lasting part, and the time constant of the latter. A reflection of a pair and its detour last for `renewal_s`
-    on average; 0: they are independent for each range.
+    """Persistence of the errors of ranges within the gate of a filter, in units of sigma.
+
+    The errors have a `mean`, an independent part with the variance `own_variance`, and a part with the variance
+    `lasting_variance` that successive ranges of a pair share, with the correlation time `time_s`. A reflection of a
+    pair lasts for `renewal_s` on average; 0 means that reflections of ranges are independent.
     """
 
     mean: Metres
@@ -66,7 +70,7 @@ class LastingErrors:
 
 @dataclass(frozen=True, slots=True)
 class PairErrors:
-    """Factors of a pair of tags on the common noise, odds of a reflection, and mean exponential detour."""
+    """Factors of a pair of tags on the common noise, the odds of a reflection, and the mean exponential detour."""
 
     noise: Positive
     odds: Positive
@@ -90,7 +94,7 @@ CheckedFeature = Annotated[
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorShapes:
-    """Parameters of each range (n,), or of one: noise, share of reflections, mean of their exponential detour, m."""
+    """Parameters of each range (n,), or of one: noise, share of reflections, and mean exponential detour, in metres."""
 
     noise_m: Any
     tail_share: Any
@@ -99,18 +103,18 @@ class ErrorShapes:
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorModel:
-    """Core, tail and outliers of the errors of corrected ranges, metres and shares of 1.
+    """Error model of corrected ranges: noise, reflections (the tail) and outliers, in metres and shares of 1.
 
-    `noise_m` and `tail_share` are those at `lifted` powers, for a pair that is not among `pairs` (named
-    "smaller-larger"). `levels` are pairs of a share of the fitted errors and the model's probability of the same
-    quantile; they correct quantiles where the shape of the model is wrong. `scale` corrects the total standard
-    deviation. `detour_m` is the mean of both kinds of exponential detour; `long_share` of the reflections are
-    `long_factor` times as long as the others. Without `long_share` there is one kind, as in calibrations of uwbcal up
-    to 0.2.0. `between_m` is the part of the noise that is constant for a pair during a recording, or a part of it, and
-    differs in the next; the noise also includes the uncertainty of delays and curve. `features` are slopes of the log
-    odds of a reflection. A range with a known feature has `known_log_odds` in addition, because `tail_share` is the
-    share of reflections among ranges without features. `lasting` is the persistence of errors within the gate of a
-    filter; None if it is not known.
+    `noise_m` and `tail_share` are values at `lifted` powers, for a pair that is not in `pairs` (keys such as "1-2", the
+    smaller id first). `levels` are pairs of a share of the fitted errors and the model's probability of the same
+    quantile; they correct quantiles if the model has another shape than the errors. `scale` corrects the total standard
+    deviation. `detour_m` is the mean of both kinds of exponential detour; the share `long_share` of the reflections has
+    detours that are `long_factor` times as long as the others on average. With `long_share` 0 there is one kind, as in
+    calibrations of uwbcal up to 0.2.0. `between_m` is the part of the noise that is constant for a pair during a
+    recording, or a part of it, and differs between recordings; the noise also includes the uncertainty of delays and
+    curve. `features` are slopes of the log odds of a reflection. The log odds of a range with a known feature also
+    include `known_log_odds`, because `tail_share` is the share of reflections among ranges without features. `lasting`
+    is the persistence of errors within the gate of a filter; None if unknown.
     """
 
     lifted: tuple[Number, ...]
@@ -132,9 +136,9 @@ class ErrorModel:
     known_log_odds: LogOdds = 0.0
 
     def log_odds_of(self, features: NDArray[np.floating]) -> Floats:
-        """Return the log odds of a reflection (n,) that `FEATURES` (n, 2) of ranges add, 0 if all are unknown.
+        """Return the change of the log odds of a reflection (n,) by `FEATURES` (n, 2) of ranges, 0 if all are unknown.
 
-        If only one feature is unknown, its centre is used.
+        If one of two features is unknown, its centre is used.
         """
         found, known = np.zeros(len(features)), np.zeros(len(features), dtype=bool)
         for name, slope in self.features.items():
@@ -144,11 +148,11 @@ class ErrorModel:
         return found + self.known_log_odds * known
 
     def between(self, between_m: float, correction_m: Floats | float = 0.0) -> ErrorModel:
-        """Return the model for other recordings, in which pairs differ by `between_m`.
+        """Return the model for ranges of other recordings, with additional noise.
 
-        `correction_m` (nodes,) are standard deviations of the correction at the powers `lifted`: with few ranges,
-        delays and curve are uncertain, and corrected ranges share that error. Both are the same for pairs with little
-        and with much noise, so the pairs' factors on noise shrink towards 1.
+        `between_m` is the standard deviation of a pair's constant error between recordings. `correction_m` (nodes,) are
+        the standard deviations of the correction at the powers `lifted`, by the uncertainty of delays and curve. Both
+        are equal for all pairs, so the factors of pairs on noise shrink towards 1.
         """
         noise_m = np.hypot(np.hypot(self.noise_m, between_m), correction_m)
         own, added = np.median(self.noise_m), np.hypot(between_m, np.median(correction_m))
@@ -159,21 +163,27 @@ class ErrorModel:
         return replace(self, noise_m=tuple(noise_m.tolist()), between_m=between_m, pairs=pairs)
 
     def within_m(self, noise_m: Floats) -> Floats:
-        """Return the part of the noise of ranges (n,), metres, that varies within a recording: at least a tenth of it,
-        because other calibrations may state less noise than `between_m`."""
+        """Return the part of the noise of ranges (n,), in metres, that varies within a recording.
+
+        It is at least a tenth of the noise, because edited calibrations may state less noise than `between_m`.
+        """
         return np.sqrt(np.maximum(np.square(noise_m) - self.between_m**2, (0.1 * noise_m) ** 2))
 
     @property
     def long(self) -> LongDetours:
-        """Return the second kind of detour."""
+        """Return the share of the long kind of detour, and the ratio of its mean to that of the other kind."""
         return LongDetours(share=self.long_share, factor=self.long_factor)
 
     def square_m2(self, detour_m: Any) -> Any:
-        """Return the mean square of detours whose exponential part has such a mean."""
+        """Return the mean square of detours whose exponential part has the mean `detour_m`, in square metres."""
         return self.least_m**2 + 2 * self.least_m * detour_m + 2 * self.long.square * detour_m**2
 
     def square_below_m2(self, detour_m: Any, below_m: Any) -> Any:
-        """Return the mean of squares of detours below a bound, and of zero for longer ones."""
+        """Return the mean square of detours, with those longer than `below_m` counted as zero.
+
+        Each kind of detour is `least_m` + x with an exponential x of mean m, so E[x^k; x < b] = k! m^k P(k + 1, b / m)
+        with the regularised incomplete gamma function P.
+        """
         powers = (1, 2, 3), (self.least_m**2, 2 * self.least_m, 2.0)
         return sum(
             part * factor * mean_m ** (k - 1) * gammainc(k, np.maximum(below_m - self.least_m, 0.0) / mean_m)
@@ -182,15 +192,15 @@ class ErrorModel:
         )
 
     def shapes(self, lifted: Floats, initiator: Ints, target: Ints, log_odds: Floats | float = 0.0) -> ErrorShapes:
-        """Return the shape of the errors of ranges (n,) at lifted powers between two tags, in either direction.
+        """Return the parameters of the errors of ranges (n,) at lifted powers between two tags, in either direction.
 
-        `log_odds` (n,) are those that features add (`log_odds_of`).
+        `log_odds` (n,) is the change by features (`log_odds_of`).
         """
         pairs = pairs_of(initiator, target)
         return self._shapes(lifted, _with_odds(self._factors_of(pairs)[pairs.number], log_odds))
 
     def _shapes(self, lifted: Floats, factors: Floats) -> ErrorShapes:
-        """Return shapes at lifted powers (...), from logarithms of factors (..., 3)."""
+        """Return the parameters at lifted powers (...), given logarithms of the factors of pairs (..., 3)."""
         log_noise, log_odds = self.logarithms
         odds = np.interp(lifted, self.lifted, log_odds) + factors[..., 1]
         return ErrorShapes(
@@ -206,7 +216,7 @@ class ErrorModel:
         return np.log(self.noise_m), np.log(share / (1 - share))
 
     def _factors_of(self, pairs: Pairs) -> Floats:
-        """Return logarithms of the factors of pairs (pairs, 3) on noise, odds and detour; an unknown pair has none."""
+        """Return logarithms of the factors of pairs (pairs, 3) on noise, odds and detour, 0 for pairs not fitted."""
         common = PairErrors(1.0, 1.0, 1.0)
         known = [self.pairs.get(pair_name(ends), common) for ends in pairs.ends.tolist()]
         return np.log([(one.noise, one.odds, one.detour) for one in known]).reshape(-1, 3)
@@ -246,10 +256,10 @@ class ErrorModel:
         target: Ints,
         log_odds: Floats | float = 0.0,
     ) -> Floats:
-        """Return the quantiles (n, k) of errors at shares (k,), for ranges (n,); NaN without a power.
+        """Return the quantiles (n, k) of the errors of ranges (n,) at `probabilities` (k,); NaN without a power.
 
-        They are computed at the model's powers for each pair, and at some of the `log_odds` (n,) that features add, and
-        interpolated linearly.
+        They are computed for each pair on a grid of the powers `lifted` and of the `log_odds` by features, and
+        interpolated linearly. Raises `BadInputError` for probabilities that are not between 0 and 1.
         """
         given = np.asarray(probabilities, dtype=np.float64)
         if given.ndim != 1 or not len(given) or not np.all((given > 0) & (given < 1)):
@@ -257,7 +267,7 @@ class ErrorModel:
         pairs = pairs_of(initiator, target)
         odds = np.broadcast_to(log_odds, len(lifted))
         low, high = (odds.min(), odds.max()) if len(odds) else (0.0, 0.0)
-        # Between two of 17 nodes of a span of 8, odds change by a factor of 1.6.
+        # If log odds span 8, odds change by a factor of 1.6 from one of the 17 nodes to the next.
         at_odds = np.linspace(low, high, 17) if high > low else np.array([low, low + 1.0])
         factors = _with_odds(self._factors_of(pairs)[:, None], at_odds)
         tables = self._table(self._own_levels(given), factors.reshape(-1, 3))
@@ -269,7 +279,7 @@ class ErrorModel:
         return found
 
     def tail_given(self, error_m: Floats, shapes: ErrorShapes) -> tuple[Floats, Floats]:
-        """Return the probabilities (n,) that ranges with known errors were reflected, and that they are outliers."""
+        """Return the probabilities (n,) of a reflection and of an outlier, given the errors of ranges (n,)."""
         error, inside = error_m - self.location_m, 1 - self.outlier_share
         found = densities(error, shapes.noise_m, self.least_m, shapes.detour_m, self.long)
         core = inside * (1 - shapes.tail_share) * found.direct
@@ -277,20 +287,23 @@ class ErrorModel:
         wide = max(self.outlier_m, 1e-9)
         wild = self.outlier_share * np.exp(-0.5 * (error / wide) ** 2) / (wide * ROOT_2PI)
         total = core + tail + wild
-        # If all three densities are zero, only an outlier is possible.
+        # If all three densities underflow to zero, the range is an outlier.
         nothing = total <= 0
         total = np.where(nothing, 1.0, total)
         return np.asarray(tail / total), np.where(nothing, 1.0, wild / total)
 
     def _table(self, levels: Floats, factors: Floats) -> Floats:
-        """Return quantiles (pairs, nodes, k) of the uncorrected model at its powers, for logarithms of factors."""
+        """Return quantiles (pairs, nodes, k) at `levels` (k,), without the correction by `self.levels`.
+
+        `factors` (pairs, 3) are logarithms of factors; nodes are the powers `lifted`.
+        """
         shapes = self._shapes(np.array(self.lifted), factors[:, None, :])
         noise, share, detour = (x[..., None] for x in (shapes.noise_m, shapes.tail_share, shapes.detour_m))
 
         def difference(error_m: Floats, noise: Floats, share: Floats, detour: Floats, level: Floats) -> Floats:
             return self.below(error_m, ErrorShapes(noise_m=noise, tail_share=share, detour_m=detour)) - level
 
-        # Quantiles lie within 12 sigmas of noise or outliers and 25 means of the longest detour.
+        # Brackets of the root: probabilities beyond 12 sigma of noise or outliers, or 25 mean detours, are below 1e-10.
         reach = 12.0 * (noise + self.outlier_m)
         high = self.location_m + reach + self.least_m + 25.0 * self.long.longest * detour
         bounds = self.location_m - reach, high
@@ -298,7 +311,7 @@ class ErrorModel:
         return np.asarray(found.x)
 
     def _own_levels(self, probabilities: Floats) -> Floats:
-        """Return the levels of the uncorrected model for shares of errors."""
+        """Return the model's probabilities of quantiles (k,), from the shares of errors below them (k,)."""
         if not self.levels:
             return probabilities
         found, own = np.array(self.levels).T
@@ -306,7 +319,7 @@ class ErrorModel:
 
 
 def _with_odds(factors: Floats, log_odds: Floats | float) -> Floats:
-    """Return logarithms of factors (..., 3) with more log odds (...)."""
+    """Return logarithms of factors (..., 3) after adding log odds (...)."""
     more = np.zeros((*np.broadcast_shapes(factors.shape[:-1], np.shape(log_odds)), 3))
     more[..., 1] = log_odds
     return np.asarray(factors + more)
@@ -323,11 +336,12 @@ CheckedErrors = Annotated[
 
 
 def lasting_errors(ranges: Ranges, z: Floats, share: Floats, reflected: Floats) -> LastingErrors | None:
-    """Fit the persistence, by pair, of errors over sigma (n,) and of reflections. Ranges have a share of reflections
-    (n,) and a probability given their errors (n,). Returns None without enough products of errors within the gate.
+    """Fit the persistence of the errors of pairs, and of their reflections; None without enough data.
 
-    Let v be the variance of the probabilities and w the remaining variance of the true state (1 or 0). Two ranges of
-    one reflection have the covariance v v/(v + w) if the shares are right, and more otherwise.
+    `z` (n,) are errors divided by sigma, `share` (n,) the probabilities of a reflection before the error is known, and
+    `reflected` (n,) those given the error. Let v be the variance of the probabilities and w the remaining variance of
+    the true state (1 if reflected, else 0). Then the probabilities of two ranges with the same reflection have the
+    covariance v^2 / (v + w) if the shares are right, and more otherwise; this is the lower bound of the fit.
     """
     inside = np.flatnonzero(z**2 < GATE)
     mean, total = float(np.mean(z[inside])), float(np.var(z[inside]))
@@ -335,26 +349,25 @@ def lasting_errors(ranges: Ranges, z: Floats, share: Floats, reflected: Floats) 
     if found is None:
         return None
     lasting = min(max(found[0], 1e-6), 0.99 * total)
-    more = reflected - np.mean(reflected - share) - share
-    told = float(np.mean(more**2))
-    left = float(np.mean(reflected * (1 - reflected)))
-    renewal = _persistence(ranges, more, told**2 / max(told + left, 1e-12))
+    deviation = reflected - share - np.mean(reflected - share)
+    known = float(np.mean(deviation**2))
+    unknown = float(np.mean(reflected * (1 - reflected)))
+    renewal = _persistence(ranges, deviation, known**2 / max(known + unknown, 1e-12))
     return LastingErrors(mean, total - lasting, lasting, found[1], renewal[1] if renewal else 0.0)
 
 
 def _persistence(ranges: Ranges, values: Floats, least: float = 0.0) -> tuple[float, float] | None:
-    """Return variance, `least` or more, and time of an autocovariance a exp(-lag / time) of values (n,) by pair.
+    """Fit the autocovariance a exp(-lag / time) of values (n,) within pairs and sessions; return a and the time (s).
 
-    None without enough products.
-
-    The autocovariance is averaged in bins of the logarithm of the lag; bins with few products are left out.
+    The products of values are averaged in bins of the logarithm of the lag; bins with fewer than 50 are left out. a is
+    at least `least`. Returns None if no bin is left.
     """
     pairs = pairs_of(ranges.initiator, ranges.target)
     pair = ranges.session * np.int64(len(pairs.ends)) + pairs.number
     order = np.lexsort((ranges.time_ns, pair))
     pair, time_s, away = pair[order], ranges.time_ns[order] * 1e-9, values[order]
-    # A filter forgets its position within about a second; with lags up to a minute the fit describes the first second
-    # less well, and positions in an office became 32 % worse instead of equal.
+    # A filter forgets its position within about a second, so the fit must be good at short lags. With lags up to a
+    # minute it is worse there: the RMSE of positions in an office increased by 32 %, instead of 0 %.
     longest_s = 2.0
     edges = np.geomspace(0.01, longest_s, 17)
     count, product, lag = np.zeros((3, len(edges) + 1))
@@ -367,10 +380,10 @@ def _persistence(ranges: Ranges, values: Floats, least: float = 0.0) -> tuple[fl
         count += np.bincount(place, minlength=len(count))
         product += np.bincount(place, (away[step:] * away[:-step])[same], len(count))
         lag += np.bincount(place, apart[same], len(count))
-    told = np.flatnonzero(count[:-1] >= 50)
-    if not len(told):
+    full = np.flatnonzero(count[:-1] >= 50)
+    if not len(full):
         return None
-    covariance, lag = product[told] / count[told], lag[told] / count[told]
+    covariance, lag = product[full] / count[full], lag[full] / count[full]
     times = np.geomspace(0.02, longest_s, 60)
     shapes = np.exp(-lag / times[:, None])
     size = np.maximum(shapes @ covariance / np.sum(shapes**2, axis=1), least)

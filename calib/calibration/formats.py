@@ -41,7 +41,7 @@ from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, TX_SHARE
 def programmed(path: str | os.PathLike[str]) -> AntennaDelays:
     """Return the antenna delays that were programmed into devices, from a recording or a file (.toml).
 
-    Raises what `Recording.open` and `load_antenna_delays` raise.
+    Raises the errors of `Recording.open` and `load_antenna_delays`, and `BadInputError` for a recording without them.
     """
     if Path(path).suffix == ".toml":
         return load_antenna_delays(Path(path))
@@ -55,15 +55,16 @@ def programmed(path: str | os.PathLike[str]) -> AntennaDelays:
 def registers(
     calibration: Calibration, base: AntennaDelays | None = None, *, firmware: bool = False
 ) -> dict[int | None, AntennaDelay]:
-    """Return the antenna delays to program into tags, given those programmed during the recording.
+    """Return the antenna delays to program into tags, in ticks.
 
-    The latter are the calibration's `antenna_delays`, or `base` (`programmed`) if it has none. The chip adds the
-    transmitter's register to transmit stamps and takes the receiver's from receive stamps. A recorded stamp is the
-    true one plus d_t = 0.44 d or d_r = -0.56 d, so both registers grow by their share of -d (docs/theory.md). With
-    `firmware`, its constant for the stamps of delayed replies is that of the transmitter; without, it stays as it was.
-    Raises `BadInputError` for a value that 16 bits do not hold, for delays that the data do not determine (their
-    registers would be right only with some other devices), if the programmed delays are unknown, and if calibration and
-    `base` contradict each other.
+    They are those programmed during the recording plus a correction. The former are the calibration's `antenna_delays`,
+    or `base` (`programmed`) if it has none. The chip adds the transmitter's register to transmit stamps, and subtracts
+    the receiver's register from receive stamps. A recorded transmit stamp is the true one plus d_t = 0.44 d, a receive
+    stamp the true one plus d_r = -0.56 d, so -0.44 d is added to the transmitter's register and -0.56 d to the
+    receiver's (docs/theory.md). With `firmware`, its constant for the stamps of delayed replies is set to the
+    transmitter's register; otherwise it does not change. Raises `BadInputError` for values outside 16 bits, for delays
+    that the data do not determine (their registers would be right only with some other devices), if the programmed
+    delays are unknown, and if calibration and `base` contradict each other.
     """
     free = free_delays(calibration)
     if free:
@@ -72,7 +73,7 @@ def registers(
             f"set a known delay (`fixed_ns`), or fit ranges between more tags (csv and json state what is known)",
             parameter="to",
         )
-    found = _on_top(calibration, base)
+    found = _to_program(calibration, base)
     unknown = [tag for tag in calibration.delays_ns if tag not in found]
     if unknown:
         raise BadInputError(
@@ -84,9 +85,9 @@ def registers(
 
 
 def antenna_delays_warning(calibration: Calibration, path: str | os.PathLike[str]) -> str:
-    """Return a warning if the antenna delays programmed in a recording differ from those of a calibration.
+    """Return a warning if the antenna delays programmed during a recording differ from those of a calibration.
 
-    Returns "" if they are equal or unknown; raises the errors of `Recording.open`.
+    Returns "" if they are equal or unknown. Raises the errors of `Recording.open`.
     """
     with Recording.open(path) as opened:
         now, tags = antenna_delays_in(opened.meta(), str(path)), [tag.tag for tag in opened.tags()]
@@ -94,14 +95,14 @@ def antenna_delays_warning(calibration: Calibration, path: str | os.PathLike[str
 
 
 def free_delays(calibration: Calibration) -> list[int]:
-    """Return the tags whose own delays the data do not determine, even if sums with others are determined."""
+    """Return the tags whose delays the data do not determine, including those with determined sums."""
     return [tag for tag, std in sorted(calibration.delays_std_ns.items()) if not math.isfinite(std)]
 
 
-def _on_top(calibration: Calibration, base: AntennaDelays | None) -> dict[int | None, AntennaDelay]:
-    """Return the antenna delays to program by tag, determined or not; without tags whose programmed delays are unknown.
+def _to_program(calibration: Calibration, base: AntennaDelays | None) -> dict[int | None, AntennaDelay]:
+    """Return the antenna delays to program by tag, determined or not; tags with unknown programmed delays are left out.
 
-    The sum of both registers is rounded once, because ranges depend on the sum.
+    The sum of both registers is rounded, and not each of them, because ranges depend on the sum.
     """
     tags = sorted(calibration.delays_ns)
     if base is not None and (differ := delays_differ(calibration.antenna_delays, base, tags)):
@@ -150,7 +151,7 @@ def _miluv(calibration: Calibration) -> str:
 def _ros_yaml(calibration: Calibration, base: AntennaDelays | None) -> str:
     to_program = {
         tag: {"tx_antenna_delay": one.tx, "rx_antenna_delay": one.rx}
-        for tag, one in _on_top(calibration, base).items()
+        for tag, one in _to_program(calibration, base).items()
         if tag not in calibration.sides
     }
     tags = {str(t): {"delay_ns": d} | to_program.get(t, {}) for t, d in sorted(calibration.delays_ns.items())}
@@ -171,7 +172,7 @@ def _ros_yaml(calibration: Calibration, base: AntennaDelays | None) -> str:
 
 
 def _error_tables(model: ErrorModel) -> dict[str, Any]:
-    """Return the error model by pair and lifted power, as tables for interpolation."""
+    """Return tables of the error model over lifted power for each pair, and for "other" pairs."""
     lifted, pairs = np.array(model.lifted), {}
     for name in [*model.pairs, "other"]:
         first, second = np.repeat((0, 0) if name == "other" else ends_of(name), len(lifted)).reshape(2, -1)
@@ -190,7 +191,7 @@ def _error_tables(model: ErrorModel) -> dict[str, Any]:
 
 _C_HEAD: Final = """\
 /* Calibration of ranging tags: antenna delays, bias and standard deviation of ranges by first-path power, and patterns
-   over direction. Include it where ranges are corrected, and call uwb_correct(), or uwb_correct_toward() where
+   over direction. Include this file where ranges are corrected, and call uwb_correct(), or uwb_correct_toward() if
    directions are known. C99 and C++; needs math.h. */
 #ifndef UWB_CALIBRATION_H
 #define UWB_CALIBRATION_H
@@ -199,7 +200,7 @@ _C_HEAD: Final = """\
 """
 
 _C_CODE: Final = """
-/* A curve's value in metres: a polynomial between each two knots, held constant where nothing was measured. */
+/* The value of a curve in metres: a polynomial between two knots, constant outside the fitted powers. */
 static double uwb_curve(const double *left, const double *coefficients, size_t pieces, size_t terms, double low,
                         double high, double lifted)
 {
@@ -217,8 +218,8 @@ static int uwb_measured(double power_dbm) { return power_dbm > UWB_FAINTEST_DBM 
 
 static double uwb_lift(double power_dbm) { return pow(10.0, (power_dbm - UWB_ALPHA_DBM) / 10.0); }
 
-/* The lifted power of an exchange, whose powers are made whole: one that was not measured is taken to be the other's.
-   Returns 0 where neither was measured. */
+/* Compute the lifted power of an exchange. If one of its powers was not measured, it is replaced by the other.
+   Returns 1, or 0 if neither was measured. */
 static int uwb_lifted(double *fpp1_dbm, double *fpp2_dbm, double *lifted)
 {
     if (!uwb_measured(*fpp1_dbm) && !uwb_measured(*fpp2_dbm))
@@ -232,9 +233,9 @@ static int uwb_lifted(double *fpp1_dbm, double *fpp2_dbm, double *lifted)
     return 1;
 }
 
-/* Correct a range in metres by the powers of both ends in dBm (0 or NaN: not measured). Returns 0; 1 where the power is
-   beyond the fitted ones; 2 where no power was measured (only the delays are corrected, sigma is NaN); -1 for a tag
-   that has no delay and for a pair whose correction is not determined (nothing is written). sigma_m may be NULL. */
+/* Correct a range in metres, given the powers of both ends in dBm (0 or NaN: not measured). Returns 0; 1 if the power
+   is outside the fitted ones; 2 if no power was measured (only the delays are corrected, sigma is NaN); -1 for a tag
+   without a delay and for a pair whose correction is not determined (nothing is written). sigma_m may be NULL. */
 static inline int uwb_correct(double range_m, double fpp1_dbm, double fpp2_dbm, int initiator, int target,
                               double *corrected_m, double *sigma_m)
 {
@@ -258,7 +259,7 @@ static inline int uwb_correct(double range_m, double fpp1_dbm, double fpp2_dbm, 
     return lifted < UWB_LOWEST || lifted > UWB_HIGHEST;
 }
 
-/* Add the harmonics in the direction of a unit vector, less their centre. */
+/* Add the spherical harmonics at a unit vector, minus their centre, to values. */
 static void uwb_harmonics(const double *toward, const double *centre, double *values)
 {
     const double x = toward[0], y = toward[1], z = toward[2], first = sqrt(3.0), second = sqrt(15.0);
@@ -275,9 +276,10 @@ static void uwb_harmonics(const double *toward, const double *centre, double *va
         values[k] -= centre[k];
 }
 
-/* By how much directions make a range longer than on average, in metres. toward_initiator is the unit vector (x, y, z)
-   from the initiator's antenna to the target's in the frame of the initiator's body, toward_target the one back in the
-   frame of the target's; NULL, or NaN in it, where it is not known. *unknown_m2 is the variance of what is unknown. */
+/* The excess of a range by directions, relative to the average direction, in metres. toward_initiator is the unit
+   vector (x, y, z) from the initiator's antenna to the target's in the frame of the initiator's body; toward_target is
+   that from the target's antenna to the initiator's in the frame of the target's body. NULL or NaN: unknown.
+   *unknown_m2 is the variance of the excess. */
 static double uwb_pattern(int initiator, int target, const double *toward_initiator, const double *toward_target,
                           double *unknown_m2)
 {
@@ -307,7 +309,7 @@ static double uwb_pattern(int initiator, int target, const double *toward_initia
     return longer;
 }
 
-/* Correct a range as uwb_correct() does, and by the directions of uwb_pattern(). */
+/* Correct a range as uwb_correct() does, and subtract the excess by directions, uwb_pattern(). */
 static inline int uwb_correct_toward(double range_m, double fpp1_dbm, double fpp2_dbm, int initiator, int target,
                                      const double *toward_initiator, const double *toward_target, double *corrected_m,
                                      double *sigma_m)
@@ -319,9 +321,9 @@ static inline int uwb_correct_toward(double range_m, double fpp1_dbm, double fpp
     return status;
 }
 
-/* By how much the temperatures of both tags, in degrees Celsius, make a range longer, in metres: subtract it from what
-   uwb_correct() gives. NaN where one is not known. *unknown_m2 is the variance of what is unknown: add it to the square
-   of what uwb_errors() gives. */
+/* The excess of a range by the temperatures of both tags in degrees Celsius (NaN: unknown), in metres: subtract it from
+   the range of uwb_correct(). *unknown_m2 is the variance of the excess: add it to the square of the standard deviation
+   of uwb_errors(). */
 static inline double uwb_warmth(int initiator, int target, double initiator_c, double target_c, double *unknown_m2)
 {
     double longer = 0.0;
@@ -348,9 +350,9 @@ static inline double uwb_warmth(int initiator, int target, double initiator_c, d
 """
 
 _C_ERRORS: Final = """
-/* What errors to expect of ranges of two tags that uwb_correct_toward() corrects, reflections included: their standard
-   deviation about their mean, that mean (reflections make ranges long), in metres, and the share of them that are
-   reflected. Where a direction is not known, the first contains the pattern. Returns 0; 2 where no power was measured
+/* The expected errors of ranges of two tags after uwb_correct_toward(), reflections included: standard deviation about
+   the mean, the mean (above 0, because reflections lengthen ranges), in metres, and the probability of a reflection.
+   The standard deviation includes the pattern of tags with an unknown direction. Returns 0; 2 if no power was measured
    (all are NaN). */
 static inline int uwb_errors_toward(double fpp1_dbm, double fpp2_dbm, int initiator, int target,
                                     const double *toward_initiator, const double *toward_target, double *sigma_total_m,
@@ -365,7 +367,7 @@ static inline int uwb_errors_toward(double fpp1_dbm, double fpp2_dbm, int initia
         k++;
     part = (lifted - uwb_error_lifted[k]) / (uwb_error_lifted[k + 1] - uwb_error_lifted[k]);
     part = part < 0.0 ? 0.0 : part > 1.0 ? 1.0 : part;
-    /* The last row is that of a pair that was not there when the calibration was made. */
+    /* The last row is for pairs that were not fitted. */
     while (pair < UWB_ERROR_PAIRS && !((uwb_error_pair[pair][0] == initiator && uwb_error_pair[pair][1] == target) ||
                                        (uwb_error_pair[pair][0] == target && uwb_error_pair[pair][1] == initiator)))
         pair++;
@@ -380,7 +382,7 @@ static inline int uwb_errors_toward(double fpp1_dbm, double fpp2_dbm, int initia
                   *tail_share *
                       (UWB_LEAST_M * UWB_LEAST_M + 2.0 * UWB_LEAST_M * detour + UWB_DETOUR_SQUARE * detour * detour)) +
              UWB_OUTLIER_SHARE * UWB_OUTLIER_M * UWB_OUTLIER_M - *mean_error_m * *mean_error_m;
-    /* Where the curve of bias is held constant, a range may be off by what it would go on by. */
+    /* Outside the fitted powers the bias curve is constant; its linear extrapolation estimates the error of that. */
     away = lifted < UWB_LOWEST    ? (UWB_LOWEST - lifted) * UWB_SLOPE_BELOW
            : lifted > UWB_HIGHEST ? (lifted - UWB_HIGHEST) * UWB_SLOPE_ABOVE
                                   : 0.0;
@@ -390,7 +392,7 @@ static inline int uwb_errors_toward(double fpp1_dbm, double fpp2_dbm, int initia
     return 0;
 }
 
-/* The same of ranges that uwb_correct() corrects, without directions. */
+/* The same for ranges after uwb_correct(), without directions. */
 static inline int uwb_errors(double fpp1_dbm, double fpp2_dbm, int initiator, int target, double *sigma_total_m,
                              double *mean_error_m, double *tail_share)
 {
@@ -401,10 +403,10 @@ static inline int uwb_errors(double fpp1_dbm, double fpp2_dbm, int initiator, in
 
 
 def c_header(calibration: Calibration) -> str:
-    """Return a C header that contains only tables and static functions.
+    """Return a C header with tables and static functions that correct ranges.
 
-    Curves are written as polynomials with 17 digits, so that C and Python differ only by rounding. A range contains
-    half of each delay, as in `Calibration.correct` without weights.
+    Curves are written as polynomials, and numbers with all their digits, so that C and Python differ only by rounding.
+    Each delay has the weight one half, as in `Calibration.correct` without `weights`.
     """
     tags = sorted(calibration.delays_ns)
     metres = [calibration.delays_ns[tag] * 1e-9 * calibration.speed_of_light for tag in tags]
@@ -420,7 +422,7 @@ def c_header(calibration: Calibration) -> str:
         f"#define UWB_FAINTEST_DBM {_number(FAINTEST_DBM)}",
         f"#define UWB_LOUDEST_DBM {_number(LOUDEST_DBM)}",
         f"static const int uwb_tag[UWB_TAGS] = {{{', '.join(map(str, tags))}}};",
-        "/* Where only sums of delays are known: ranges can be corrected if the sides of both tags add to 0. */",
+        "/* Sides of tags if only sums of delays are known: a range can be corrected if those of its tags add to 0. */",
         f"static const int uwb_side[UWB_TAGS] = {{{', '.join(str(calibration.sides.get(tag, 0)) for tag in tags)}}};",
         f"static const double uwb_delay_m[UWB_TAGS] = {{{_numbers(metres)}}};",
         *_c_curve("bias", bias),
@@ -492,12 +494,10 @@ def _c_dependences(calibration: Calibration, tags: list[int]) -> list[str]:
 
 
 def _c_curve(name: str, curve: Curve) -> list[str]:
-    """Return a curve as polynomials between its knots: the start of each, and its coefficients, the highest first."""
+    """Return a curve as polynomials between its knots: their starts, and their coefficients from the highest power."""
     degree, count = curve.degree, len(curve.coefficients)
     whole = PPoly.from_spline((np.array(curve.knots), np.array(curve.coefficients), degree))
-    pieces = [
-        k for k in range(degree, count) if whole.x[k + 1] > whole.x[k]
-    ]  # equal knots have no polynomial between them
+    pieces = [k for k in range(degree, count) if whole.x[k + 1] > whole.x[k]]  # not those between equal knots
     low, high = curve.range
     return [
         f"static const double uwb_{name}_left[] = {{{_numbers(whole.x[pieces])}}};",
@@ -514,7 +514,7 @@ def _numbers(values: Iterable[float]) -> str:
 
 
 def _number(value: float) -> str:
-    """Return a literal of type double."""
+    """Return a C literal of type double."""
     text = repr(float(value))
     return text if any(c in text for c in ".en") else f"{text}.0"
 
@@ -528,7 +528,7 @@ FORMATS: Final[dict[str, Callable[[Calibration, AntennaDelays | None], str]]] = 
     "ros-yaml": lambda calibration, base: _ros_yaml(calibration, base),
     "c-header": lambda calibration, _: c_header(calibration),
 }
-"""Functions from a calibration and programmed delays to text, by format."""
+"""Functions that return the text of a calibration, given it and programmed antenna delays, by format."""
 
 
 def export(
@@ -539,14 +539,14 @@ def export(
     base: AntennaDelays | None = None,
     force: bool = False,
 ) -> str:
-    """Return a calibration as text in another form, and write it to `path` where one is given.
+    """Return a calibration as text in another format, and write it to `path` if given.
 
     `to` is "registers" (values for the DW1000's antenna-delay registers, as TOML), "firmware" (the same, and the
-    constants of the firmware's build), "json", "csv" (delays), "miluv", "ros-yaml" or "c-header" (tables and a function
-    that corrects a range). Registers include the antenna delays programmed during the recording: the calibration's
-    `antenna_delays`, or `base` (`programmed`). Raises `BadInputError` for another form, for a calibration with groups
-    of tags or patterns over direction in a form that has one curve, and for registers of tags whose delays the data do
-    not determine.
+    constants of the firmware's build), "json", "csv" (delays), "miluv", "ros-yaml" or "c-header" (tables and functions
+    that correct a range). Registers include the antenna delays programmed during the recording: the calibration's
+    `antenna_delays`, or `base` (`programmed`). Raises `BadInputError` for another format, for parts of the calibration
+    that the format has no fields for (constants of pairs, groups of tags, patterns over direction, slopes over
+    temperature), and the errors of `registers`.
 
     >>> import calib
     >>> print(calib.export(calib.fit(calib.sample_flight()).calibration, "registers").splitlines()[2])
@@ -587,11 +587,11 @@ CURVES_OF_MILUV: Final = ("bias_spline_m", "std_spline_m")
 
 
 def read_miluv(path: Path) -> Calibration:
-    """Read the JSON form of MILUV's published calibration; raises `BadInputError`.
+    """Read the JSON file of MILUV's published calibration; raises `BadInputError` for other content.
 
-    Its bias curve applies to each reception (`power_at="reception"`), while fitted curves here apply to the mean of an
-    exchange's lifted powers. Its delays are relative to 16436 in both registers, as programmed into the boards. Other
-    keys are kept and exported again.
+    Its bias curve applies to each reception (`power_at` "reception"); fitted curves here apply to the mean of an
+    exchange's lifted powers. Its delays are relative to 16436 ticks in both registers, as programmed into the boards.
+    Other keys are kept in the provenance and exported again.
     """
     text = read_text(path, BadInputError, "calibration of MILUV (.json)")
     try:

@@ -1,4 +1,4 @@
-"""The calibration: antenna delays, curves and error model. It corrects ranges and prints itself."""
+"""The calibration: antenna delays, curves and error model, the correction of ranges, and tables."""
 
 from __future__ import annotations
 
@@ -75,7 +75,8 @@ class TagGroup:
 class Uncertainty:
     """Covariance matrices of a fit.
 
-    `delays_ns2` (tags, tags) goes with `tags`; `bias_m2` and `sigma_m2` (m, m) go with the coefficients of the curves.
+    `delays_ns2` (tags, tags) is that of the delays of `tags`; `bias_m2` and `sigma_m2` (m, m) are those of the
+    coefficients of the two curves.
     """
 
     tags: Tags
@@ -112,22 +113,22 @@ Registers = Annotated[
 class Calibration:
     """Antenna delays of tags, in nanoseconds, and the curves of bias and standard deviation.
 
-    A standard error is infinite if the data did not determine the delay. `power_at` is the argument of the bias curve:
+    A standard error is infinite if the data do not determine the delay. `power_at` is the argument of the bias curve:
     "exchange", the lifted power of the exchange, which `lift` computes from both powers; or "reception", each of the
-    two powers, with half of each bias in a range, as in published curves that correct single stamps. With `groups`,
-    each has its own curves, and the plain ones are the groups' average, for display only. `errors` is the error model
-    of corrected ranges, by pair and power; None if unknown, as in older and in imported calibrations. `pair_offsets`,
-    by pair with the smaller id first, are constant errors in addition to delays and curves; a pair without one cannot
-    be corrected then. `antenna_delays` were programmed into the tags during the recording, and the delays are relative
-    to them; empty if unknown.
+    two powers, with half of each bias in a range, as in published curves that correct single stamps. If there are
+    `groups`, each has its own curves, and `bias_curve` and `sigma_curve` are their averages, for display only. `errors`
+    is the error model of corrected ranges, by pair and power; None if unknown, as in older and in imported
+    calibrations. `pair_offsets`, by pair with the smaller id first, are constant errors in addition to delays and
+    curves; if there are any, pairs without one cannot be corrected. `antenna_delays` were programmed into the tags
+    during the recording, and the delays are relative to them; empty if unknown.
 
-    `undetermined_splits` are pairs of sides, such as anchors and robots, that ranged only with each other: all delays
-    of one side can be larger and those of the other smaller by the same amount. Of their tags, only ranges between the
-    two sides can be corrected. If one side is empty, all delays of the other can be shifted together: they are stated
-    relative to their mean, and correct only differences of arrival without stamps. `patterns` describe the dependence
-    of ranges on the directions between the antennas, and `temperatures` that on the temperatures of both ends; if
-    directions or temperatures are unknown, ranges are corrected without them, and `sigma_total_m` includes the missing
-    effect.
+    `undetermined_splits` are pairs of sides, such as anchors and robots, whose tags ranged only with the other side:
+    all delays of one side can increase and those of the other decrease by the same amount. Of their ranges, only those
+    between the two sides can be corrected. If one side is empty, all delays of the other can be shifted together: they
+    are stated relative to their mean, and correct only differences of arrival without stamps. `patterns` describe the
+    dependence of ranges on the directions between the antennas, and `temperatures` that on the temperatures of both
+    ends; if directions or temperatures are unknown, ranges are corrected without them, and `sigma_total_m` includes
+    the missing effect.
     """
 
     delays_ns: Annotated[dict[TagKey, DelayNs], IN_ORDER]
@@ -152,9 +153,7 @@ class Calibration:
 
     @property
     def sides(self) -> dict[int, int]:
-        """Return the side of each tag in a split: the number of the split, from 1, positive for one side and negative
-        for the other.
-        """
+        """The side of each tag in a split: the number of the split, from 1, with the sign + or - for its two sides."""
         return {
             tag: sign * number
             for number, sides in enumerate(self.undetermined_splits, 1)
@@ -167,18 +166,18 @@ class Calibration:
 
         If only differences of delays are known, they are the standard errors of the delays minus their mean.
         """
-        alone = {tag for sides in self.undetermined_splits if not all(sides) for tags in sides for tag in tags}
+        relative = {tag for sides in self.undetermined_splits if not all(sides) for tags in sides for tag in tags}
         return {
-            tag: self.std_of_sum_ns([tag]) if tag in alone else self.delays_std_ns.get(tag, math.nan)
+            tag: self.std_of_sum_ns([tag]) if tag in relative else self.delays_std_ns.get(tag, math.nan)
             for tag in sorted(self.delays_ns)
-            if tag in alone or tag not in self.sides
+            if tag in relative or tag not in self.sides
         }
 
     @property
     def pair_constants(self) -> dict[tuple[int, int], PairOffset]:
-        """Return the constant errors of pairs whose delays are not known separately.
+        """The constant errors of pairs whose delays are not known separately.
 
-        These are `pair_offsets`, and the pairs between the sides of `undetermined_splits`.
+        These are `pair_offsets`, and those of pairs between the sides of `undetermined_splits`.
         """
         found, half_m = dict(self.pair_offsets), 0.5e-9 * self.speed_of_light
         for one, other in self.undetermined_splits:
@@ -188,16 +187,16 @@ class Calibration:
         return found
 
     def std_of_sum_ns(self, tags: Collection[int]) -> float:
-        """Return the standard error of the sum of some tags' delays, NaN if it is not known."""
+        """Return the standard error of the sum of some tags' delays in ns, NaN if the covariance is not known."""
         if self.uncertainty is None:
             return math.nan
         own = np.isin(self.uncertainty.tags, list(tags))
         return math.sqrt(max(float(own @ np.array(self.uncertainty.delays_ns2) @ own), 0.0))
 
     def covariance_ns2(self, tags: Sequence[int]) -> Floats:
-        """Return the covariance of some delays (tags, tags), zero where nothing is stated.
+        """Return the covariance of some delays (tags, tags) in ns², 0 for those without a finite standard error.
 
-        It is that of the fit if known; otherwise diagonal, with the squares of the standard errors.
+        It is that of the fit if known; otherwise it is diagonal, with the squares of the standard errors.
         """
         std_ns = np.array([self.delays_std_ns.get(tag, math.nan) for tag in tags])
         found = np.diag(np.where(np.isfinite(std_ns), std_ns, 0.0) ** 2)
@@ -222,11 +221,11 @@ class Calibration:
     def lifted(self, ranges: Ranges) -> Floats:
         """Return the lifted power of each range, as this calibration defines it."""
         lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, self.lift, self.alpha_dbm)
-        # If nothing depends on power, a range without power gets the full correction.
+        # If all curves are flat, ranges without power get any lifted power, and so the full correction.
         return lifted if self.needs_power else np.where(np.isfinite(lifted), lifted, self.bias_curve.range[0])
 
     def __repr__(self) -> str:
-        """Return tables of delays, and of the curves at a few powers."""
+        """Return tables of delays, constants, dependences, and of the curves at a few powers."""
         return "\n".join([_headline(self), *(as_text(title, rows) for title, rows in _tables(self).items())])
 
     def _repr_html_(self) -> str:
@@ -235,14 +234,19 @@ class Calibration:
         return f"<p>{escape(_headline(self))}</p>{''.join(tables)}"
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write the calibration as JSON, whole or not at all; replaces a file only with `force`."""
+        """Write the calibration as JSON.
+
+        The file appears when it is complete; an existing file is replaced only with `force`. Raises the errors of
+        `uwblink.output.write_text`.
+        """
         write_text(Path(path), self.to_json(), force=force)
 
     def apply(self, ranges: Ranges) -> CorrectedRanges:
-        """Correct ranges: c (w_i d_i + w_j d_j) for the delays (ICRA 2023, section III), then the curve.
+        """Correct ranges: add c (w_i d_i + w_j d_j) for the delays (ICRA 2023, section III), subtract constants of
+        pairs, the bias curve, and the effects of direction and temperature.
 
-        Raises `BadInputError` naming the tags that have no delay in this calibration, the pair that has no constant, or
-        the pair that an undetermined split leaves open.
+        Raises `BadInputError` that names tags without a delay in this calibration, a pair without a constant, or pairs
+        that the calibration cannot correct because of an undetermined split.
         """
         return corrected_ranges(self, ranges)
 
@@ -250,13 +254,14 @@ class Calibration:
         """Correct differences of arrival at listeners: for the target's delay, the bias of each reception, and the
         range.
 
-        The result has a row for each of the ranges' `arrivals`. With initiator i, target j, listener k, and bias b and
-        noise e of receptions of poll (1) and response (2), a difference of arrival is d_jk - d_ik - c d_j + b1_j + b2_k
-        - b1_k; the corrected range in place of d_ij leaves (e1_j - e2_i)/2 + e2_k - e1_k. With sigma of the curve at
-        the powers of exchange, response and poll its variance is sigma_ij^2 + 2 sigma_jk^2 + 2 sigma_ik^2, because
-        a reception has twice the variance of a range; where the rate of the clocks comes from a third message, one
-        factor is above 2 and one below (`applying.reception_gains`). The listener's delay cancels. Raises
-        `BadInputError` if a delay is not known, or only in a sum with others.
+        The result has a row for each of the ranges' `arrivals`. For initiator i, target j and listener k, with bias b
+        and noise e of the receptions of poll (1) and response (2) and the antenna delay D_j, the measured difference is
+        d_jk - d_ik - c D_j + b1_j + b2_k - b1_k plus noise (`calib.data.arrivals`). The corrected range is used in
+        place of the distance d_ij, so the noise is (e1_j - e2_i)/2 + e2_k - e1_k. Its variance is sigma_ij^2 +
+        2 sigma_jk^2 + 2 sigma_ik^2, with the curve at the powers of exchange, response and poll, because a reception
+        has twice the variance of a range. If the clock rates are compared by a third message, one factor is above 2 and
+        the other below (`applying.reception_gains`). The listener's delay cancels. Raises `BadInputError` without
+        differences of arrival, if a delay is unknown or known only in a sum with others, and if there are patterns.
 
         >>> import calib
         >>> ranges = calib.load_ranges(calib.sample_flight())
@@ -270,9 +275,10 @@ class Calibration:
     def quantiles(self, ranges: Ranges, shares: Sequence[float] = (0.025, 0.975)) -> Floats:
         """Return the quantiles (n, k) of the errors of corrected ranges, in metres, for shares (k,).
 
-        They depend on pair, power and features. With 95 % probability the true distance lies between the corrected
-        range minus its 97.5 % quantile and the corrected range minus its 2.5 % quantile. NaN without a power. Raises
-        `UnanswerableError` for a calibration without `errors`, `BadInputError` for shares that are not between 0 and 1.
+        They depend on pair, power and features; without a power they are NaN. With 95 % probability the true distance
+        lies between the corrected range minus its 97.5 % quantile and the corrected range minus its 2.5 % quantile.
+        Raises `UnanswerableError` for a calibration without `errors`, and `BadInputError` for shares that are not
+        between 0 and 1.
 
         >>> import calib
         >>> known = calib.fit(calib.sample_flight()).calibration
@@ -333,16 +339,17 @@ class Calibration:
         elevation_deg: tuple[Any, Any] = (0.0, 0.0),
         temperature_c: tuple[Any, Any] = (math.nan, math.nan),
     ) -> CorrectedRange[Any]:
-        """Correct one range, or arrays of them (n,); returns the corrected range and its standard deviations, in
+        """Correct one range, or arrays of them (n,); return the corrected range and its standard deviations, in
         metres.
 
         `range_m` is the range that the board reports; powers are in dBm, NaN or 0 if the board has none. A call takes
         less than a millisecond, for one range or for hundreds. `weights` are those of the two delays
-        (`uwblink.twr.delay_weights`); the default, one half each, assumes equal clock rates (K = 1), which causes an
-        error of a millionth of the delays, at most a hundredth of a millimetre. `azimuth_deg` and `elevation_deg` are
-        the directions from the antennas of initiator and target to each other, in the frames of their bodies, NaN if
-        unknown; only a calibration with `patterns` uses them. `temperature_c` are the temperatures of both, used only
-        by a calibration with `temperatures`. Results and errors are those of `apply`.
+        (`uwblink.twr.delay_weights`); the default, one half each, assumes equal clock rates. Rates differ by at most
+        40 ppm (IEEE 802.15.4, 15.4.9), which changes a range by less than 0.01 mm per ns of delay. `azimuth_deg` and
+        `elevation_deg` are the directions from the antennas of initiator and target to each other, in the frames of
+        their bodies, NaN if unknown; only a calibration with `patterns` uses them. `temperature_c` are the temperatures
+        of initiator and target; only a calibration with `temperatures` uses them. Results and errors are those of
+        `apply`, but a range without power is corrected for delays only.
 
         >>> import calib
         >>> known = calib.fit(calib.sample_flight()).calibration
@@ -415,7 +422,7 @@ def _checked(calibration: Calibration) -> Calibration:
     }
     for name, size in sizes.items():
         rows = getattr(known, name)
-        # A variance of 0 may come out of a decomposition a little below 0.
+        # Rounding errors may make a variance of 0 slightly negative.
         if len(rows) != size or any(len(row) != size or row[k] < -1e-9 for k, row in enumerate(rows)):
             raise ValueError(
                 f"uncertainty: {name}: expected {size} rows of {size} numbers, with variances of 0 or more"
@@ -427,7 +434,7 @@ _ADAPTER: Final[TypeAdapter[Calibration]] = TypeAdapter(Annotated[Calibration, A
 
 
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:
-    """Return the calibration in a JSON file; raises `BadInputError` that names the file, and the key that is wrong.
+    """Return the calibration in a JSON file; raises `BadInputError` that names the file and the wrong key.
 
     >>> import calib
     >>> calib.load_calibration("nowhere.json")
@@ -439,7 +446,7 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
 
 
 class CalibrationResult:
-    """Base of the results of a fit and a survey: a calibration, its origin, and the findings about it."""
+    """Base of the results of a fit and of a survey: a calibration, a headline on its data, and findings."""
 
     __slots__ = ()
     calibration: Calibration
@@ -464,18 +471,18 @@ class CalibrationResult:
         return f"<p>{escape(self.headline())}</p>{self.calibration._repr_html_()}{warned}"
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write the calibration as JSON, whole or not at all; replaces a file only with `force`."""
+        """Write the calibration as JSON (`Calibration.save`)."""
         self.calibration.save(path, force=force)
 
 
 CalibrationSource = Calibration | CalibrationResult | str | os.PathLike[str]
-"""A calibration, the result of a fit or a survey, or the path of a calibration's file."""
+"""A calibration, the result of a fit or a survey, or the path of a calibration file."""
 
 
 def given_calibration(source: CalibrationSource, parameter: str = "calibration") -> Calibration:
-    """Return the calibration that an argument gives.
+    """Return the calibration that an argument contains or names.
 
-    Raises `BadInputError` that names `parameter` if it gives none, and the errors of `load_calibration`.
+    Raises `BadInputError` that names `parameter` for objects of other types, and the errors of `load_calibration`.
     """
     known = load_calibration(source) if isinstance(source, str | os.PathLike) else source
     known = getattr(known, "calibration", known)
@@ -486,7 +493,7 @@ def given_calibration(source: CalibrationSource, parameter: str = "calibration")
 
 
 def _tables(calibration: Calibration) -> dict[str, list[tuple[str, ...]]]:
-    """Return the tables of a calibration by title: delays, constants of pairs, and curves."""
+    """Return the tables of a calibration by title; those without rows are left out."""
     bodies = {
         "Antenna delays": [("tag", "delay (ns)", "interval"), *delay_rows(calibration)],
         "Constants": [("pair", "constant (cm)", "interval"), *pair_rows(calibration)],
@@ -534,8 +541,8 @@ def delay_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 
 def pattern_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """Return the tags of each pattern over direction, its root mean square in cm, and its largest value and
-    direction.
+    """Return the tags of each pattern over direction, its root mean square in cm, and its largest value at elevation 0,
+    with the azimuth.
     """
     around = np.radians(np.arange(360))
     level = np.column_stack([np.cos(around), np.sin(around), np.zeros(360)])
@@ -553,7 +560,7 @@ def temperature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
     """Return the tags of each slope over temperature, the slope, and the text of its interval and reference
     temperature.
     """
-    why = _sentence(calibration, "temperature", lambda told: told.get("why") or "", BadInputError)
+    why = _sentence(calibration, "temperature", lambda entry: str(entry.get("why") or ""), BadInputError)
     rows = [
         (
             first_few(map(str, one.tags)),
@@ -562,7 +569,7 @@ def temperature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
         )
         for one in calibration.temperatures
     ]
-    return rows + [("all", "none", f"{why}")] * bool(why)
+    return rows + [("all", "none", why)] * bool(why)
 
 
 def feature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
@@ -576,7 +583,7 @@ def feature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 
 def curve_rows(calibration: Calibration) -> list[tuple[str, ...]]:
-    """Return lifted powers, and the values of the curves there: for each group of tags, or for all tags."""
+    """Return a row of lifted powers, and rows of the values of the curves there, for each group of tags."""
     shown = np.linspace(*calibration.bias_curve.range, 6)
     named: dict[str, Calibration | TagGroup] = dict(calibration.groups) or {"": calibration}
     rows = [("lifted power", *(f"{power:.3g}" for power in shown))]
@@ -598,7 +605,7 @@ def _headline(calibration: Calibration) -> str:
 
 
 def known_facts(provenance: Mapping[str, Any]) -> str:
-    """Return the facts that replace known distances; none if distances were known."""
+    """Return a text on the facts that a fit used instead of known distances; "" if distances were known."""
     known = provenance.get("rests_on")
     if provenance.get("truth") != "ranges" or not isinstance(known, Mapping):
         return ""
@@ -615,47 +622,50 @@ def known_facts(provenance: Mapping[str, Any]) -> str:
 
 
 def held_out_line(calibration: Calibration) -> str:
-    """Return one line about the fit without the held-out ranges, evaluated on these; "" if none were held out."""
+    """Return one line on the errors of held-out ranges with a fit to the others; "" if none were held out."""
     return _sentence(calibration, "held_out", _held_out, BadInputError)
 
 
 def _sentence(
-    calibration: Calibration, key: str, told: Callable[[Mapping[str, Any]], str], error: type[Exception]
+    calibration: Calibration, key: str, sentence: Callable[[Mapping[str, Any]], str], error: type[Exception]
 ) -> str:
-    """Return the text that `told` makes of an entry of the provenance, "" without an entry; raises an error for a bad
-    one.
+    """Return the text of an entry of the provenance by the function `sentence`; "" without an entry.
+
+    Raises `error` if the entry has not the form that a fit writes.
     """
     entry = calibration.provenance.get(key)
     if not isinstance(entry, Mapping):
         return ""
     with raising(error, f"provenance: {key}: not as `calib fit` writes it", KeyError, TypeError, ValueError):
-        return told(entry)
+        return sentence(entry)
 
 
-def _held_out(told: Mapping[str, Any]) -> str:
-    inside = "" if told["inside_95"] is None else f", {100 * told['inside_95']:.0f} % within their 95 % intervals"
+def _held_out(entry: Mapping[str, Any]) -> str:
+    inside = "" if entry["inside_95"] is None else f", {100 * entry['inside_95']:.0f} % within their 95 % intervals"
     return (
-        f"evaluated on {told['ranges']} ranges held out by {told['fold']}: median {100 * told['raw_median_m']:+.1f} to "
-        f"{100 * told['median_m']:+.1f} cm, robust deviation {100 * told['raw_robust_std_m']:.1f} to "
-        f"{100 * told['robust_std_m']:.1f} cm{inside}"
+        f"evaluated on {entry['ranges']} ranges held out by {entry['fold']}: median "
+        f"{100 * entry['raw_median_m']:+.1f} to {100 * entry['median_m']:+.1f} cm, robust deviation "
+        f"{100 * entry['raw_robust_std_m']:.1f} to {100 * entry['robust_std_m']:.1f} cm{inside}"
     )
 
 
 def age_line(calibration: Calibration) -> str:
-    """Return one line: the days in which 95 % of delays change ranges by less than 2 cm; "" without several dated
-    sessions.
+    """Return one line: the number of days during which 95 % of delays change ranges by less than 2 cm.
+
+    It is "" if the fit did not have several sessions with dates.
     """
     return _sentence(calibration, "drift", _age, ValueError)
 
 
-def _age(told: Mapping[str, Any]) -> str:
-    least, likeliest, most = ((0.02 / TWO_SIDED_95) ** 2 / max(rate, 1e-12) for rate in told["m2_per_day"][::-1])
+def _age(entry: Mapping[str, Any]) -> str:
+    # Delays are random walks, with a variance of ranges of `m2_per_day` (lower bound, estimate, upper bound).
+    least, likeliest, most = ((0.02 / TWO_SIDED_95) ** 2 / max(rate, 1e-12) for rate in entry["m2_per_day"][::-1])
     within = "95 % of delays change ranges by less than 2 cm for"
     days = f"{within} {likeliest:.0f} days ({least:.0f} to {most:.0f}, 95 %)"
-    over = f"{told['sessions']} sessions over {told['days']:.0f} days"
-    if not told["told"]:
-        return f"{over} tell no drift: {within} {least:.0f} days or more"
-    why = "delays drift" if told["by_age"] else "delays differ, and do not tell whether by age; if so"
+    over = f"{entry['sessions']} sessions over {entry['days']:.0f} days"
+    if not entry["told"]:
+        return f"{over} show no drift: {within} {least:.0f} days or more"
+    why = "delays drift" if entry["by_age"] else "delays differ, but not significantly by age; if it is a drift"
     return f"{over}: {why}, {days}"
 
 

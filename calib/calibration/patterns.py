@@ -1,6 +1,4 @@
-"""Dependences of delays: on direction, as low-order harmonics in the frame of the antenna's body; and on
-temperature.
-"""
+"""Dependences of ranges on direction, as spherical harmonics in the frame of the tag's body, and on temperature."""
 
 from __future__ import annotations
 
@@ -22,14 +20,14 @@ if TYPE_CHECKING:
     from calib.data.ranges import Ranges
 
 HARMONICS: Final = 8
-"""Number of spherical harmonics of degrees 1 and 2: waves once and twice around, as published patterns have them."""
+"""Number of spherical harmonics of degrees 1 and 2, one and two periods around: published patterns have these."""
 
 
 def harmonics(toward: Floats | NDArray[np.float32]) -> Floats:
     """Return the real spherical harmonics of degrees 1 and 2 (n, 8) at unit vectors (n, 3).
 
-    Their mean over all directions is 0, their mean square 1. The first three are the components of the vector: a wrong
-    lever arm has the same effect.
+    Their mean over all directions is 0 and their mean square is 1. The first three are proportional to the components
+    of the vector: an error of the lever arm has the same effect.
     """
     x, y, z = np.asarray(toward, dtype=np.float64).T
     first = np.sqrt(3) * np.array([x, y, z])
@@ -58,7 +56,7 @@ class Pattern:
         return np.asarray(harmonics(toward) - np.array(self.centre))
 
     def std_m(self, values: Floats) -> Floats:
-        """Return the standard error of a sum of the pattern at such values (n, 8), or sums of them."""
+        """Return the standard error (n,) in metres, at `values` (n, 8), or at sums of the values of two ends."""
         variance = np.einsum("ni,ij,nj->n", values, np.array(self.covariance_m2), values)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
@@ -77,10 +75,10 @@ CheckedPattern = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class TemperatureSlope:
-    """Growth of ranges of some tags per kelvin of one end above `reference_c`.
+    """Linear dependence of the ranges of some tags on temperature.
 
-    The slope is `m_per_k` for each end, with the standard error `std_m_per_k`. `span_c` are the lowest and the highest
-    of the fitted temperatures.
+    Each end contributes `m_per_k` times its temperature minus `reference_c`; `std_m_per_k` is the standard error of the
+    slope. `span_c` are the lowest and the highest fitted temperature.
     """
 
     covariate: ClassVar[str] = "temperature_c"
@@ -92,32 +90,33 @@ class TemperatureSlope:
 
     @property
     def coefficients_m(self) -> tuple[float]:
-        """Return the slope as a tuple, like the coefficients of a `Pattern`."""
+        """The slope as a tuple, like the coefficients of a `Pattern`."""
         return (self.m_per_k,)
 
     @property
     def centre(self) -> tuple[float]:
-        """Return the reference temperature, like the centre of a `Pattern`."""
+        """The reference temperature as a tuple, like the centre of a `Pattern`."""
         return (self.reference_c,)
 
     @property
     def covariance_m2(self) -> tuple[tuple[float]]:
-        """Return the variance of the slope, like the covariance of a `Pattern`."""
+        """The variance of the slope as a matrix, like the covariance of a `Pattern`."""
         return ((self.std_m_per_k**2,),)
 
     @property
     def rms_m(self) -> float:
-        """Return the standard deviation of an end with unknown temperature: the slope times the standard deviation of
-        the fitted span.
+        """A bound of the standard deviation of an end with unknown temperature, in metres.
+
+        It is the slope, including its standard error, times the whole span of the fitted temperatures.
         """
         return math.hypot(self.m_per_k, self.std_m_per_k) * (self.span_c[1] - self.span_c[0])
 
     def values(self, temperature_c: Floats | NDArray[np.float32]) -> Floats:
-        """Return temperatures (n,) less the reference, (n, 1)."""
+        """Return temperatures (n,) minus the reference, (n, 1)."""
         return np.asarray(temperature_c, dtype=np.float64)[:, None] - self.reference_c
 
     def std_m(self, values: Floats) -> Floats:
-        """Return the standard error of the slope times such values (n, 1), or sums of them."""
+        """Return the standard error (n,) in metres, at `values` (n, 1), or at sums of the values of two ends."""
         return np.asarray(self.std_m_per_k * np.abs(values[:, 0]))
 
 
@@ -128,11 +127,10 @@ CheckedSlope = Annotated[
 
 
 def dependences_m(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Floats]:
-    """Return the effect of directions and temperatures on ranges (n,), and its standard deviation (n,).
+    """Return the effect of directions and temperatures on ranges (n,), and its standard deviation (n,), in metres.
 
-    An unknown direction has the effect 0, and its variance includes the mean square of the pattern; an unknown
-    temperature also has the effect 0, and its standard deviation is the slope times the spread of the fitted
-    temperatures.
+    For an end with an unknown direction or temperature the effect is 0, and the variance includes the square of `rms_m`
+    of the pattern or slope.
     """
     longer, variance = np.zeros((2, len(ranges)))
     every: tuple[Pattern | TemperatureSlope, ...] = (*calibration.patterns, *calibration.temperatures)
@@ -150,14 +148,14 @@ def dependences_m(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Flo
 
 
 def lack_direction(calibration: Calibration, ranges: Ranges) -> Bools:
-    """Return a mask (n,) of the ranges with a pattern over direction at an end whose direction is unknown."""
+    """Return a mask (n,) of ranges in which a tag with a pattern has an unknown direction."""
     tags = [tag for one in calibration.patterns for tag in one.tags]
     ends = np.column_stack([ranges.initiator, ranges.target])
     return np.asarray((np.isin(ends, tags) & np.isnan(ranges.toward).any(axis=2)).any(axis=1))
 
 
 def warn_of_directions(lacking: int, count: int, source: str) -> None:
-    """Give a `DirectionWarning` if some of `count` ranges have no direction although the calibration has a pattern."""
+    """Give a `DirectionWarning` if `lacking` of `count` ranges have no direction at a tag with a pattern."""
     if lacking:
         warn(
             f"{source}: {100 * lacking / count:.3g} % of the ranges have no known direction: they are corrected "
@@ -167,9 +165,10 @@ def warn_of_directions(lacking: int, count: int, source: str) -> None:
 
 
 def warn_of_temperatures(calibration: Calibration, ranges: Ranges, beyond_k: float = 5.0) -> None:
-    """Give a `TemperatureWarning` that names the tags whose temperatures are outside the fitted ones.
+    """Give a `TemperatureWarning` that names tags with temperatures more than `beyond_k` outside the fitted ones.
 
-    A slope that is known to half of the manual's 2.15 mm/K is off by 5 mm after 5 K, less than ranges repeat to.
+    Within 5 K a slope with an error of half of the manual's 2.15 mm/K (DW1000 user manual, section 8.3.1) changes
+    ranges by 5 mm, less than their repeatability.
     """
     ends = np.column_stack([ranges.initiator, ranges.target])
     for low, high in sorted({one.span_c for one in calibration.temperatures}):

@@ -1,4 +1,4 @@
-"""First-path power: lifting, and curves over lifted power."""
+"""Lifted power, and curves over it."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ ALPHA_DBM: Final = -82.0
 """The power whose lifted power is 1 (ICRA 2023, section IV)."""
 
 DEGREE: Final = 3
-"""Degree of fitted curves: cubic splines have a continuous second derivative, which measures their roughness."""
+"""Degree of fitted curves. Cubic splines have a continuous second derivative, which measures their roughness."""
 
 SIGMA_SEGMENTS: Final = 4
-"""Segments of the curve of the noise, which a prior on its roughness makes as straight as the data allow."""
+"""Number of segments of the curve of the noise; a prior on its roughness keeps it smooth."""
 
 SIGMA_FLOOR_M: Final = 0.002
-"""A tick is 4.7 mm long; no range is better than half of one."""
+"""Smallest standard deviation of ranges: about half of a tick of 4.7 mm."""
 
 
 def lift(power_dbm: Floats, alpha_dbm: float) -> Floats:
     """Return 10^((p - alpha)/10) (ICRA 2023, section IV)."""
-    # exp takes a third of the time of a power of ten.
+    # np.exp takes a third of the time of 10 ** x.
     return np.asarray(np.exp((power_dbm - alpha_dbm) * (np.log(10) / 10)))
 
 
@@ -35,8 +35,8 @@ LIFTS: Final[dict[str, Callable[[Floats, Floats, float], Floats]]] = {
     "mean-of-lifted": lambda fpp1, fpp2, alpha: (lift(fpp1, alpha) + lift(fpp2, alpha)) / 2,
     "lift-of-mean": lambda fpp1, fpp2, alpha: lift((fpp1 + fpp2) / 2, alpha),
 }
-"""Functions from the powers of both ends (n,) to the lifted power of an exchange: the authors' code, and the paper's
-formula."""
+"""Functions of the powers of both ends (n,) and of alpha, in dBm, that return the lifted power of exchanges (n,): as in
+the code of the authors of ICRA 2023, and as in the formula of the paper."""
 
 
 def lifted_power(fpp1_dbm: Floats, fpp2_dbm: Floats, how: str, alpha_dbm: float) -> Floats:
@@ -56,7 +56,7 @@ def ends(fpp1_dbm: Floats, fpp2_dbm: Floats) -> tuple[Floats, Floats]:
 class Curve:
     """A B-spline over lifted power, held constant outside `range`, where nothing was measured.
 
-    A flat curve has the same value at any power, and for ranges without power.
+    A flat curve has the same value at all powers, and also for ranges without power.
     """
 
     knots: tuple[Number, ...]
@@ -79,22 +79,19 @@ class Curve:
         return min(self.coefficients) == max(self.coefficients)
 
     def inside(self, lifted: Floats) -> Bools:
-        """Return a mask (n,) of the lifted powers within the fitted range; a flat curve holds at all powers, measured
-        or not.
-        """
+        """Return a mask (n,) of lifted powers within the fitted range; True for all, also NaN, if the curve is flat."""
         return np.asarray(self.flat | ((lifted >= self.range[0]) & (lifted <= self.range[1])))
 
     def beyond(self, lifted: Floats | float) -> Floats:
-        """Return the change (n,) of a linear extrapolation beyond the ends, where the curve is held constant, in
-        metres.
+        """Return the size (n,) of the change that a linear extrapolation would give outside the range, in metres.
 
-        It is zero at fitted powers, and estimates the error of a range outside them.
+        The curve is held constant there, so this estimates its error. It is zero within the range.
         """
         low, high = self.range
         away = np.asarray(lifted - np.clip(lifted, low, high))
         if not away.any():
             return away
-        step = 0.1 * (high - low)  # the slope at an end is that of a tenth of the range
+        step = 0.1 * (high - low)  # slopes at the ends are those over a tenth of the range
         ends = self(np.array([low, low + step, high - step, high]))
         return np.asarray(np.abs(np.where(away < 0, ends[1] - ends[0], ends[3] - ends[2]) / step * away))
 
@@ -115,22 +112,23 @@ SigmaCurve = Annotated[
 
 
 def flat_curve(value_m: float, span: tuple[float, float]) -> Curve:
-    """Return a curve of one value, with the two lifted powers of `span` as its range."""
+    """Return a constant curve in metres, with the lifted powers `span` as its range; an empty span is widened."""
     low, high = span if span[1] > span[0] else (0.999 * span[0], 1.001 * span[1])
     return Curve((low,) * (DEGREE + 1) + (high,) * (DEGREE + 1), (value_m,) * (DEGREE + 1), DEGREE, (low, high))
 
 
 def populated(ordered: Floats) -> tuple[float, float]:
-    """Return the range of lifted power, sorted (n,), in which a curve is fitted: all but half a percent at each end."""
+    """Return the range in which a curve is fitted: the 0.5 % and 99.5 % quantiles of lifted powers, sorted (n,)."""
     low, high = np.quantile(ordered, [0.005, 0.995]).tolist()
     return low, high
 
 
 def knots_for(ordered: Floats, segments: int, span: tuple[float, float] | None = None) -> Floats:
-    """Return clamped knots with `segments` intervals, halfway between equal counts and equal lengths, of sorted powers.
+    """Return clamped knots of a cubic spline with a number of segments, for lifted powers, sorted (n,).
 
-    They lie on `span`, by default the populated range. Equal counts alone leave the sparse high powers to one long
-    segment, equal lengths the sparse ones without data.
+    They lie in `span`, by default the `populated` range, halfway between segments of equal counts and of equal lengths.
+    With equal counts, one long segment would cover the sparse high powers; with equal lengths, some segments would have
+    no data.
     """
     low, high = span or populated(ordered)
     quantiles = np.clip(np.quantile(ordered, np.linspace(0, 1, segments + 1)), low, high)
@@ -140,15 +138,16 @@ def knots_for(ordered: Floats, segments: int, span: tuple[float, float] | None =
 
 
 def basis(lifted: Floats, knots: Floats) -> Floats:
-    """Return the cubic B-splines of `knots` at lifted powers, clamped to their span, shape (n, m)."""
+    """Return the cubic B-splines of `knots` at lifted powers (n,), which are clamped to their span, shape (n, m)."""
     return np.asarray(BSpline.design_matrix(np.clip(lifted, knots[0], knots[-1]), knots, DEGREE).toarray())
 
 
 def curvature(knots: Floats) -> Floats:
-    """Return the integral of products of the splines' second derivatives over their span, shape (m, m).
+    """Return the integrals of products of the second derivatives of the cubic B-splines of `knots`, shape (m, m).
 
-    The second derivatives of cubics are straight between knots, so two points of Gauss a segment are exact
-    (O'Sullivan's penalty). Lengths count in spans, so the matrix has the unit of coefficients only.
+    This is the penalty matrix of O'Sullivan (1986). Second derivatives are linear between knots, so Gauss-Legendre
+    quadrature with two points per segment is exact. Powers are measured in spans of the knots, so the matrix has no
+    unit.
     """
     edges = np.unique(knots)
     middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
@@ -160,7 +159,10 @@ def curvature(knots: Floats) -> Floats:
 
 
 def equal_bins(lifted: Floats) -> Ints:
-    """Return the bin of each lifted power (n,), in order of power: bins of equal counts, at most 30, of at least 20."""
+    """Return the number of each lifted power's bin (n,), in order of power.
+
+    Bins have equal counts; there are at most 30 of them, with at least 20 powers each.
+    """
     count, number = len(lifted), np.empty(len(lifted), dtype=np.int64)
     number[np.argsort(lifted)] = np.arange(count) * min(30, max(1, count // 20)) // max(count, 1)
     return number

@@ -8,12 +8,15 @@ from uwblink.cli import start
 
 
 def main() -> NoReturn:
-    """Run the command; a mistake is one line on standard error, status 2, or 1 (see docs), Ctrl-C one and 130."""
+    """Run the command and exit.
+
+    An error is one line on standard error. Exit status: 0 done, 1 the data cannot answer, 2 bad input, 130 Ctrl-C.
+    """
     start(_run)
 
 
 def _run() -> NoReturn:
-    # Imported here, so that Ctrl-C is handled while they load.
+    # Imported here, so that Ctrl-C is handled during the imports.
     import sys
 
     from calib.cli.commands import app

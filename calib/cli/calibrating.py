@@ -132,7 +132,7 @@ def _print_fit(result: calib.FitResult, output: Path, *, as_json: bool) -> None:
 
 @contextmanager
 def _undetermined_as_json(as_json: bool) -> Iterator[None]:
-    """Print an `UnanswerableError` also as JSON if JSON was requested."""
+    """Print an `UnanswerableError` as JSON, too, if JSON was requested."""
     try:
         yield
     except UnanswerableError as error:
@@ -265,14 +265,14 @@ def show(
     if as_json:
         typer.echo(known.to_json(), nl=False)
         return
-    made, distances = known.provenance, calib.calibration.known_facts(known.provenance)
-    told = {name: made.get(name) for name in ("fitted", "gauge", "recordings", "settings")}
+    provenance, distances = known.provenance, calib.calibration.known_facts(known.provenance)
+    shown = {name: provenance.get(name) for name in ("fitted", "gauge", "recordings", "settings")}
     lines = [
-        *(f"{name}: {_listed(value)}" for name, value in told.items() if value),
-        *([f"distances: {distances}"] if distances else _survey_lines(made.get("rests_on"))),
+        *(f"{name}: {_listed(value)}" for name, value in shown.items() if value),
+        *([f"distances: {distances}"] if distances else _survey_lines(provenance.get("rests_on"))),
         *([f"age: {age}"] if (age := calib.calibration.age_line(known)) else []),
     ]
-    warnings = (f"warning: {with_flags(str(text))}" for text in made.get("warnings", []))
+    warnings = (f"warning: {with_flags(str(text))}" for text in provenance.get("warnings", []))
     typer.echo("\n".join([repr(known), *(f"  {line}" for line in lines), *warnings]))
 
 
@@ -282,15 +282,15 @@ def _listed(value: object) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def _survey_lines(rests: object) -> Iterator[str]:
-    """Yield what a survey rests on: arrangements by what was known of them, and known distances and positions."""
-    if not isinstance(rests, dict):
+def _survey_lines(facts: object) -> Iterator[str]:
+    """Yield lines on the known facts of a survey: arrangements by known shape, known distances and positions."""
+    if not isinstance(facts, dict):
         return
-    rows = [row for row in rests.get("arrangements", []) if isinstance(row, dict)]
+    rows = [row for row in facts.get("arrangements", []) if isinstance(row, dict)]
     for shape in dict.fromkeys(str(row.get("known", "")) for row in rows):
         names = ", ".join(str(row.get("name")) for row in rows if row.get("known", "") == shape)
         yield f"rests on arrangements {names}{f', on a {shape}' if shape else ''}"
-    distances, positions = rests.get("known_distances", 0), rests.get("known_positions", 0)
+    distances, positions = facts.get("known_distances", 0), facts.get("known_positions", 0)
     yield f"rests on {distances} known distances and {positions} known positions"
 
 

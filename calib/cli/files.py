@@ -87,7 +87,7 @@ def export(
     registers = calib.calibration.programmed(antenna_delays) if antenna_delays else None
     known = known_calibration(calibration)
     text = calib.export(known, to, output, base=registers, force=force)
-    # These forms hold delays without their standard errors, and all but MILUV's have the splits.
+    # These formats have no standard errors of delays. All but MILUV's have the undetermined splits.
     free = [tag for tag in calib.calibration.free_delays(known) if to == "miluv" or tag not in known.sides]
     if free and to in ("miluv", "ros-yaml", "c-header"):
         warn(f"{to} cannot state that the data do not determine the delay of tag {', '.join(map(str, free))}")

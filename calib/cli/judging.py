@@ -60,14 +60,14 @@ def evaluate(
         if report or figures:
             origin = calib.report.origin_of([*recordings, calibration], command_line())
             calib.write_report(report, parts, known, figures=figures, evaluation=evaluation, origin=origin, force=force)
-    _warn_of_seen(evaluation)
+    _warn_if_fitted(evaluation)
     written = [f"report: {path}" for path in (report, figures) if path]
     text = "\n".join([repr(evaluation), *_remarks(evaluation), *written])
     typer.echo(json.dumps(evaluation.to_dict(), indent=1) if as_json else text)
 
 
-def _warn_of_seen(evaluation: calib.evaluation.Evaluation) -> None:
-    """Warn if a calibration was evaluated on the recordings of its fit."""
+def _warn_if_fitted(evaluation: calib.evaluation.Evaluation) -> None:
+    """Warn if a calibration was evaluated on recordings of its fit."""
     if evaluation.seen:
         warn(
             f"the calibration was fitted to {', '.join(evaluation.seen)}: errors there are smaller than in other "
@@ -75,19 +75,19 @@ def _warn_of_seen(evaluation: calib.evaluation.Evaluation) -> None:
         )
 
 
-OF_MODELS: Final = {
+MODELS_OF_OPTION: Final = {
     "training": ("poses",),
     "process_noise": ("poses",),
     "seeds": ("poses",),
     "imu": ("imu", "team"),
     "start_std": ("team",),
 }
-"""The options of `localize` that some motion models use, by those; all models use the others."""
+"""The motion models that use an option of `localize`; all models use the options that are not listed."""
 
 
-def _of_model(option: str, text: str, **shown: Any) -> Any:
-    """Return an option of `localize` whose help ends with the motion models that use it."""
-    return typer.Option(help=f"{text} For --model {' or '.join(OF_MODELS[option])}.", **shown)
+def _model_option(option: str, text: str, **more: Any) -> Any:
+    """Return an option of `localize`, with the motion models that use it in its help."""
+    return typer.Option(help=f"{text} For --model {' or '.join(MODELS_OF_OPTION[option])}.", **more)
 
 
 def localize(
@@ -113,16 +113,16 @@ def localize(
     ] = "exchanges",
     training: Annotated[
         Path | None,
-        _of_model(
+        _model_option(
             "training", "Flight for tuning the fixed variances (.uwb); by default the variances of the fit are used."
         ),
     ] = None,
     process_noise: Annotated[
-        float, _of_model("process_noise", "White noise of the velocity input (m/s per axis at 100 Hz).")
+        float, _model_option("process_noise", "White noise of the velocity input (m/s per axis at 100 Hz).")
     ] = 0.3,
     imu: Annotated[
         str,
-        _of_model(
+        _model_option(
             "imu",
             "Noise of the IMUs. drone: a consumer IMU on a vibrating frame.",
             **choice("drone", "consumer", "industrial", "tactical"),
@@ -130,13 +130,13 @@ def localize(
     ] = "drone",
     start_std: Annotated[
         tuple[float, float, float],
-        _of_model(
+        _model_option(
             "start_std",
             "Uncertainty of relative positions (m), attitudes (deg) and velocities (m/s) at the first exchange, "
             "as standard deviations per axis.",
         ),
     ] = (0.1, 3.0, 0.1),
-    seeds: Annotated[int, _of_model("seeds", "Number of simulated runs, each with another seed.", min=1)] = 3,
+    seeds: Annotated[int, _model_option("seeds", "Number of simulated runs, each with another seed.", min=1)] = 3,
     online: Annotated[
         bool,
         typer.Option(
@@ -155,9 +155,10 @@ def localize(
     models = calib.evaluation.MODELS
     check_choice("model", model, models)
     check_choice("imu", imu, calib.evaluation.IMUS)
-    for option, own in OF_MODELS.items():
-        if model not in own:
-            refuse_given(context, [option], f"can only be used with `model` {' or '.join(own)}, not with {model}")
+    for option, its_models in MODELS_OF_OPTION.items():
+        if model not in its_models:
+            why = f"can only be used with `model` {' or '.join(its_models)}, not with {model}"
+            refuse_given(context, [option], why)
     check_report(None, figures, force=force)
     fields: dict[str, dict[str, Any]] = {
         "process_noise": {"velocity_std_mps": process_noise},
@@ -165,13 +166,13 @@ def localize(
         "imu": {"noise": calib.evaluation.IMUS[imu]},
         "start_std": dict(zip(("start_std_m", "start_std_deg", "start_std_m_s"), start_std, strict=True)),
     }
-    used = [values for option, values in fields.items() if model in OF_MODELS[option]]
+    used = [values for option, values in fields.items() if model in MODELS_OF_OPTION[option]]
     settings = models[model].settings(use=use, online=online, **dict(ChainMap(*used)))
     track = partial(models[model].localize, **({} if training is None else {"training": training}))
     known = known_calibration(calibration, recordings)
     with waiting("localizing"):
         found = [one for path in recordings for one in track(path, known, settings)]
-        # The text comes first: if it fails, nothing is written.
+        # Before the files: if this fails, nothing is written.
         table, text = models[model].table(found), models[model].text(found, settings)
     if tum:
         calib.evaluation.write_tum(found, tum, force=force)
@@ -187,18 +188,17 @@ def doctor(
     as_json: AsJson = False,
 ) -> None:
     """Find faults in recordings, each with evidence and remedy, and compare the clocks of pairs."""
-
-    skews, looked_at = dict[str, list[Any]](), dict[str, str]()
+    skews, parts = dict[str, list[Any]](), dict[str, str]()
     with waiting("examining"):
         found = calib.examine(recordings)
         for path in recordings:
             with uwblink.Recording.open(path) as recording:
                 skews[str(path)] = uwblink.recording.clock_skews(recording.exchange_blocks())
-                looked_at[str(path)] = calib.checks.examined_part(recording.count("exchanges"))
-    parts = {name: part for name, part in looked_at.items() if part}
+                if part := calib.checks.examined_part(recording.count("exchanges")):
+                    parts[str(path)] = part
     findings = [replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in found]
     if as_json:
-        clocks = {path: [asdict(one) for one in some] for path, some in skews.items()}
+        clocks = {path: [asdict(one) for one in pairs] for path, pairs in skews.items()}
         found_all = {"findings": [asdict(f) for f in findings], "clock_skews": clocks}
         typer.echo(json.dumps(found_all | ({"examined": parts} if parts else {}), indent=1))
         return
@@ -207,12 +207,9 @@ def doctor(
     for finding in findings:
         by_chance = f" (p = {finding.p_value:.1g})" if finding.p_value else ""
         lines += [f"{finding.fault}{by_chance}", f"  evidence: {finding.evidence}", f"  remedy:   {finding.remedy}"]
-    for name, some in skews.items():
-        lines += (
-            [f"clock skew in {name}, of the second tag relative to the first", *(f"  {one}" for one in some)]
-            if some
-            else []
-        )
+    for name, pairs in skews.items():
+        if pairs:
+            lines += [f"clock skew in {name}, of the second tag relative to the first", *(f"  {one}" for one in pairs)]
     typer.echo("\n".join(lines))
 
 
@@ -234,7 +231,7 @@ def compare(
 
 
 def spread_tests(arguments: Sequence[str]) -> list[str]:
-    """Repeat `--tests` before each of its files, so that it takes several."""
+    """Return command-line arguments with `--tests` repeated before each of its files, so that it takes several."""
     many, found = "--tests", list[str]()
     inside = False
     for word in arguments:
@@ -278,7 +275,7 @@ def report(
     else:
         typer.echo("\n".join(f"report: {path}" for path in (output, pdf, figures) if path))
         if tests:  # without tests the report itself states that the training was judged
-            _warn_of_seen(campaign.evaluation)
+            _warn_if_fitted(campaign.evaluation)
         findings = [f"{name}: {finding.fault}" for name, finding in campaign.findings]
         for warning in [*campaign.fit.warnings, *findings]:
             warn(warning)
@@ -287,7 +284,7 @@ def report(
 
 
 def _remarks(evaluation: calib.evaluation.Evaluation) -> Iterator[str]:
-    """Yield the lines below the table: quantiles, coverage, differences from planted values."""
+    """Yield the lines below the table: quantiles, spread within and between pairs, coverage, planted values."""
     group = evaluation.overall
     yield (
         f"95 % of the calibrated errors lie between {100 * group.full.low_m:+.1f} and {100 * group.full.high_m:+.1f} cm"

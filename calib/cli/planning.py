@@ -116,7 +116,7 @@ def _finish(
     as_json: bool,
     force: bool,
 ) -> None:
-    """Write the page and the figures, and print the plan and the commands that follow it."""
+    """Write the page and the figures; print the plan, and the commands that carry it out."""
     commands = list(following)
     if output or figures:
         calib.report.write_plan(found, output, figures, commands=commands, force=force)

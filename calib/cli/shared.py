@@ -18,7 +18,7 @@ from uwblink.cli.shared import output
 from uwblink.settings import flags_of
 
 STOPPED: Final = 1
-"""Exit status of a command whose fit stopped before it converged: its output is marked as not final."""
+"""Exit status if a fit stopped before it converged; its output is written, and marked as not converged."""
 
 CALIB_FLAGS: Final = {
     "boards": "COUNT",
@@ -32,7 +32,7 @@ CALIB_FLAGS: Final = {
     **flags_of(FlightSettings),
     **flags_of(SurveySettings),
 }
-"""The options that stand for parameters of calib, where they are not the parameter's name with dashes."""
+"""Options of parameters of the library, if they are not the parameter's name with dashes."""
 
 Recordings = Annotated[list[Path], typer.Argument(help="Recordings with true distances (.uwb).")]
 NewCalibration = Annotated[Path, output("Calibration to write (.json).")]
@@ -47,7 +47,7 @@ TrimStatic = Annotated[
 
 
 def with_flags(text: str) -> str:
-    """Return a text with options for the parameters in backticks: `minimum_norm` becomes --minimum-norm."""
+    """Return a text with options in place of parameters in backticks: `minimum_norm` becomes --minimum-norm."""
     return shared.with_flags(text, CALIB_FLAGS)
 
 
@@ -57,7 +57,7 @@ def warn(text: str) -> None:
 
 
 def refuse_given(context: typer.Context, options: Iterable[str], why: str) -> None:
-    """Raise `BadInputError` that says why for the first of some options that was given on the command line."""
+    """Raise `BadInputError` with the reason `why` if one of some options was given on the command line."""
     for name in options:
         source = context.get_parameter_source(name)
         if source is not None and source.name != "DEFAULT":
@@ -65,20 +65,21 @@ def refuse_given(context: typer.Context, options: Iterable[str], why: str) -> No
 
 
 def check_report(report: Path | None, figures: Path | None, *, pdf: Path | None = None, force: bool) -> None:
-    """Check the files of a report, if there are any, before anything is computed."""
+    """Check the output files of a report, if any, before the computation."""
     if report or figures:
         calib.report.check_places(report, pdf, figures, force=force)
 
 
 def command_line() -> str:
-    """Return how the command was called, for reports."""
+    """Return the command line of this process, for reports."""
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
 def known_calibration(path: Path, recordings: Iterable[Path] = ()) -> calib.Calibration:
-    """Return a calibration from its file, and warn on standard error where its fit stopped before it converged.
+    """Return the calibration in a file, with warnings on standard error.
 
-    Warns, too, where other antenna delays were programmed into the tags of recordings than where it was fitted.
+    Warns if its fit stopped before it converged, and if the antenna delays programmed during `recordings` differ from
+    those during its fit.
     """
     known = calib.load_calibration(path)
     if known.stopped:

@@ -1,4 +1,4 @@
-"""From recordings, simulations, arrays and data frames to ranges with true distances."""
+"""Ranges with true distances, from recordings, simulations, arrays and data frames."""
 
 from calib.data.sources import load_each
 

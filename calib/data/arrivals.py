@@ -1,18 +1,20 @@
 """Differences of arrival, measured by a listener that overhears an exchange.
 
-A listener k hears the poll of i and the response of j. At the target's antenna these are its reply time dt32 less its
-delay d_j apart. So by the target's clock they arrive at k
+A listener k receives the poll of initiator i and the response of target j. At the antenna of j, the time between poll
+and response is the reply time dt32 by its stamps, minus its delay d_j. So the interval between both frames at k, by the
+target's clock, is
 
     K_k (rx2 - rx1)_k = tof_ij + dt32 - d_j + tof_jk - tof_ik
 
-apart, where K_k is the rate of the target's clock over the listener's. The listener's own delay cancels, and so does
-the initiator's: each row determines the delay of one target alone, also where anchors range with tags only. How a delay
-divides into transmission and reception is in no recording of free-running clocks: a shift of a tag's clock shifts its
-transmissions and receptions alike (docs/theory.md).
+where K_k is the rate of the target's clock over that of the listener. The delays of listener and initiator cancel. Each
+row therefore determines the delay of one target alone, even if anchors range only with tags. No recording of
+free-running clocks determines how a delay divides into transmission and reception: a shift of a tag's clock shifts both
+alike (docs/theory.md).
 
-The range of the same exchange takes the place of tof_ij. Of the errors e of receptions at j (poll), i (response) and
-k, (e1_j - e2_i)/2 + e2_k - e1_k is left, which has less variance than with a known distance, e1_j + e2_k - e1_k, and
-does not correlate with the error of the range, (e1_j + e2_i)/2.
+`raw_m` uses the range of the same exchange in place of c tof_ij. With the errors e1_j of the poll at j, e2_i of the
+response at i, and e1_k and e2_k of both at k, the error of the difference is (e1_j - e2_i)/2 + e2_k - e1_k. Its
+variance is smaller than with a known distance, e1_j + e2_k - e1_k, and it is not correlated with the error of the
+range, (e1_j + e2_i)/2.
 """
 
 from __future__ import annotations
@@ -33,18 +35,20 @@ from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, elapsed
 from uwblink.twr import Exchanges, range_ns
 
 LARGEST_ERROR_M: Final = 30.0
-"""Errors beyond 100 ns come from wrong stamps: published delays are below 1 ns, beside those that are programmed."""
+"""Largest error of a difference of arrival. Errors above 100 ns come from wrong stamps: in addition to the programmed
+delays, published ones are below 1 ns."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Arrivals(ColumnTable):
     """Differences of arrival as columns of length n, one for each exchange and listener that heard poll and response.
 
-    `exchange` is the row of the exchange among the ranges. `raw_m` is by how much farther from the target than from the
-    initiator the listener is, by stamps alone and with the raw range of the exchange; `truth_m` is the true difference.
-    `poll_dbm` and `response_dbm` are the listener's first-path powers. `stretch` is the duration from poll to response
-    over the one that gives the rate of the clocks, negative where the initiator sends at both ends of the latter, 0
-    where the rate is the carrier integrator's.
+    `exchange` is the row of the exchange among the ranges. `raw_m` is the measured difference, the listener's distance
+    to the target minus its distance to the initiator, from uncorrected stamps and the raw range of the exchange;
+    `truth_m` is the true difference. `poll_dbm` and `response_dbm` are the first-path powers at the listener. `stretch`
+    is the interval from poll to response, divided by the interval over which the clock rates are compared: positive if
+    the target sends both frames of the latter, negative if the initiator does, 0 if the rate is from the carrier
+    integrator.
     """
 
     time_ns: Ints
@@ -58,14 +62,14 @@ class Arrivals(ColumnTable):
 
     @property
     def error_m(self) -> Floats:
-        """Measured less true differences (n,)."""
+        """Measured minus true differences (n,), in metres."""
         return self.raw_m - self.truth_m
 
     def _title(self) -> str:
         return f"{len(self)} differences of arrival at {len(np.unique(self.listener))} listeners"
 
     def of_exchanges(self, rows: Any, count: int) -> Arrivals:
-        """Return the rows of some exchanges, of which there were `count`, numbered as in this choice."""
+        """Return the rows of the exchanges `rows` among `count`, with `exchange` numbered within this selection."""
         chosen = np.arange(count)[rows]
         place = np.full(count, -1)
         place[chosen] = np.arange(len(chosen))
@@ -82,10 +86,10 @@ def arrivals_of(
     *,
     need_truth: bool = True,
 ) -> Arrivals:
-    """Return what listeners know of exchanges with raw ranges `range_m` (n,).
+    """Return the differences of arrival of exchanges with raw ranges `range_m` (n,) at all listeners.
 
-    `overheard` has the columns of the recording's table. Rows without the rate of the target's clock or with impossible
-    stamps are left out, with `need_truth` those without true differences, too.
+    `overheard` has the columns of the recording's table. Rows without a clock rate and rows with errors above
+    `LARGEST_ERROR_M` are left out; with `need_truth` also rows without a true difference.
     """
     row = exchange_of(exchanges, overheard)
     heard = {name: column[row >= 0] for name, column in overheard.items()}
@@ -94,7 +98,7 @@ def arrivals_of(
     away, across = (distances_m(poses, tags, ends, listener, time_ns) for ends in (e.target, e.initiator))
     between = elapsed(heard["rx2"], heard["rx1"], e.bits) * TICK_S
     reply = elapsed(e.tx2, e.rx1, e.bits) * TICK_S
-    # Less the reply first: two times of milliseconds, of which picoseconds matter.
+    # between - reply + (rate - 1) between = rate between - reply. This form keeps picoseconds of times of milliseconds.
     rate, stretch = _rates(e, heard, between)
     late = between - reply + (rate - 1) * between
     found = Arrivals(
@@ -108,17 +112,18 @@ def arrivals_of(
         stretch=stretch,
     )
     with np.errstate(invalid="ignore"):
-        # No difference is longer than the way between both senders.
+        # Without truth: a difference of two distances is at most the distance of both senders.
         beyond = np.abs(found.raw_m) - range_m[row]
         off = np.where(np.isfinite(found.truth_m) | need_truth, np.abs(found.error_m), beyond)
         return found[off < LARGEST_ERROR_M]
 
 
 def _rates(e: Exchanges, heard: Mapping[str, NDArray[Any]], between_s: Any) -> tuple[Floats, Floats]:
-    """Return how fast the target's clock runs by the listener's (n,), and the stretch of `Arrivals`.
+    """Return the rate of the target's clock over the listener's (n,), and the `stretch` of `Arrivals` (n,).
 
-    Where the target sends twice, from both transmissions; where the initiator does, from both receptions at the target
-    and at the listener; with two messages from the listener's carrier integrator.
+    If the target sends the third message, the rate is from the interval of its two transmissions and their receptions
+    at the listener; if the initiator sends it, from the interval of poll and third message as received by target and
+    listener. With two messages it is from the listener's carrier integrator.
     """
     third = {name: PROTOCOLS[name].third_sender for name in np.unique(e.protocol).tolist()}
     by_target, by_initiator = (

@@ -1,4 +1,4 @@
-"""Effects of clocks on ranges: clock skew by stamps and by carriers, and skew left in single-sided ranges."""
+"""Clock skew by stamps and by carrier integrators, and errors of single-sided ranges by skew."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import Exchanges, intervals, names_in, without_stamps
 
 PPM_TO_METRES: Final = 0.5 * SPEED_OF_LIGHT * 1e-6
-"""What a ppm of clock skew changes in a single-sided range per second of reply time: half of c times a ppm."""
+"""Error of a single-sided range per ppm of clock skew and second of reply time: c/2 times 1e-6 (m)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClocksApart:
-    """A pair, the smaller id first, whose clocks differ by `stamps_ppm` by their stamps and `carrier_ppm` by carriers.
+    """A pair, the smaller id first, with different relative clock skews by stamps and by carriers, in ppm.
 
     `moves_m` is the error of its ranges if the stamps are wrong.
     """
@@ -41,17 +41,18 @@ class ClocksApart:
 
 
 def clocks_apart(exchanges: Exchanges) -> ClocksApart | None:
-    """Return the pair whose clock ratio by the stamps is farthest from that of the carriers, None where all agree.
+    """Return the pair whose skews by stamps and by carriers differ most, by their effect on ranges; None if all agree.
 
-    Compared are exchanges of three messages with readings, of which 0 is none. Most pairs settle which sign the
-    readings have: ranges with a third message do not depend on it. A difference of 1 ppm, of a tenth of the skew, or of
-    eight standard errors of the median is no fault.
+    The comparison uses exchanges with three messages and readings of the carrier integrator; a reading of 0 means that
+    it was not read. The sign of the readings is not known, because ranges with three messages do not depend on it: the
+    sign with the better agreement over all pairs is used. Pairs agree if the median difference is below 1 ppm, below a
+    tenth of the skew, or below eight standard errors, and pairs with fewer than 20 exchanges are ignored (judgements).
     """
     readings = np.abs(exchanges.skew1_ppm) + np.abs(exchanges.skew2_ppm)
     triple = [name for name in names_in(exchanges.protocol) if PROTOCOLS[name].third_sender is not None]
     able = np.isin(exchanges.protocol, triple) & ((exchanges.tx3 | exchanges.rx3) != 0)
     rows = np.flatnonzero(able & np.isfinite(readings) & (readings != 0))
-    # So many are enough; a regular choice could coincide with the schedule of pairs.
+    # A sample bounds the run time. It is random, because a regular one could coincide with the schedule of pairs.
     some = exchanges[np.sort(np.random.default_rng(0).permutation(rows)[:20_000])]
     some = some[np.abs(target_faster_ppm(some)) < IMPOSSIBLE_PPM]
     pair = pairs_of(some.initiator, some.target).number
@@ -74,10 +75,10 @@ def clocks_apart(exchanges: Exchanges) -> ClocksApart | None:
 
 @dataclass(frozen=True, slots=True)
 class LeftSkew:
-    """Errors of single-sided ranges by clock skew, metres.
+    """Errors of single-sided ranges by clock skew, in metres.
 
-    `bound_m` is for crystals at the ends of their tolerance, `reply_s` the median reply time; `told_m` is the 95 %
-    quantile by the carriers' readings, NaN where they were not read.
+    `bound_m` is the error for crystals at the ends of their tolerance, with the median reply time `reply_s`. `told_m`
+    is the 95 % quantile of the errors that follow from readings of the carrier integrators, NaN without readings.
     """
 
     bound_m: float
@@ -102,17 +103,17 @@ class LeftSkew:
 
 
 def as_length(metres: float) -> str:
-    """Return a length as text, in the unit that suits it."""
+    """Return a length as text in m, cm or mm, depending on its size."""
     if metres >= 1:
         return f"{metres:.1f} m"
     return f"{100 * metres:.0f} cm" if metres >= 0.01 else f"{1e3 * metres:.1f} mm"
 
 
 def left_skew(exchanges: Exchanges) -> LeftSkew | None:
-    """Return the errors by skew of single-sided ranges that nothing corrected; None where there are none.
+    """Return the errors by skew of single-sided ranges with stamps and without skew correction; None without any.
 
-    A single-sided time of flight is half of round trip less reply, so a target's clock that is faster by s makes it
-    longer by s times half the reply.
+    A single-sided time of flight is (round trip - reply) / 2. If the clocks differ by the relative rate s, its error is
+    s times half of the reply time.
     """
     names = [name for name in names_in(exchanges.protocol) if is_single_sided(name) and not corrected(name)]
     some = exchanges[np.isin(exchanges.protocol, names) & ~without_stamps(exchanges)]
@@ -127,7 +128,7 @@ def left_skew(exchanges: Exchanges) -> LeftSkew | None:
 
 
 def corrected(protocol: str) -> bool:
-    """Return whether a protocol's formula takes the carriers' readings into account."""
+    """Return whether the formula of a protocol depends on readings of the carrier integrator."""
     one = np.ones(1)
     tried = [Intervals(2e7 * one, 1e7 * one, 0 * one, 0 * one, ppm * one) for ppm in (0.0, 10.0)]
     with np.errstate(all="ignore"):

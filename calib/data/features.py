@@ -1,7 +1,7 @@
 """Features of impulse responses that indicate a reflection, from the table `cirs`.
 
-A direct path that is too weak for the chip's threshold lies before the first path that the chip found. Then more energy
-comes later, and the response rises more slowly.
+If the direct path is too weak for the chip's threshold, the chip takes a later, reflected path for the first one. Then
+the response has more energy after its first path, and rises more slowly.
 """
 
 from __future__ import annotations
@@ -23,41 +23,46 @@ Columns = Mapping[str, NDArray[Any]]
 
 
 def response_features(magnitudes: Iterable[int], first_path_index: float) -> tuple[float, float]:
-    """Return the energy of an impulse response over that of its first path in dB, and the rise time in taps.
+    """Return the energy of an impulse response relative to that of its first path in dB, and its rise time in taps.
 
-    Both are NaN where the first path lies too near to the ends of the response.
+    The energy is that of taps 20 before to 100 after the first path; the first path are the three taps after its index.
+    The rise time is the number of taps from the first one above the noise to the largest of these three. Both are NaN
+    if the first path is too near to the ends of the response.
     """
     taps = np.atleast_1d(np.asarray(magnitudes, dtype=np.float64))
-    # Taps around the first path that count: 100 of them (100 ns) contain detours of 30 m.
+    # A tap is 1 ns, so 100 taps contain detours of up to 30 m.
     before, after = 20, 100
     first = int(first_path_index) if 0 <= first_path_index <= len(taps) - after else 0
-    # From tap 50 on, up to well before the first path, there is only noise.
+    # From tap 50 up to 40 taps before the first path there is only noise.
     quiet, own = taps[50 : max(first - 2 * before, 0)], taps[first + 1 : first + 4]
     if len(quiet) < before or not own.any():
         return np.nan, np.nan
     near = taps[first - before : first + after]
     noise = np.sqrt(np.mean(quiet**2) / 2)
-    # Magnitudes of noise are Rayleigh-distributed: of 20 taps one in 10,000 is above five deviations of a part.
+    # Magnitudes of noise have a Rayleigh distribution with this sigma: one of 20 exceeds 5 sigma with probability 1e-4.
     begins = int(np.argmax(near > 5 * noise)) - before
     return float(10 * np.log10(np.sum(near**2) / np.sum(own**2))), float(1 + np.argmax(own) - begins)
 
 
 def features_of(exchanges: Exchanges, source: object) -> NDArray[np.float32]:
-    """Return the `FEATURES` (n, 2) of exchanges by the table `cirs` of a source, NaN where unknown."""
+    """Return the `FEATURES` (n, 2) of exchanges from the table `cirs` of a source, NaN if unknown.
+
+    Values are means over the receptions at initiator and target.
+    """
     found = np.full((len(exchanges), len(FEATURES)), np.nan, dtype=np.float32)
     for some in _responses(source):
         of_ends = (some["board"] == some["initiator"]) | (some["board"] == some["target"])
         some = {name: column[of_ends] for name, column in some.items()}
         rows, which = _exchange_of(exchanges, some)
-        told = [response_features(some["magnitudes"][row], some["first_path_index"][row]) for row in rows]
-        for k, values in enumerate(np.array(told).reshape(-1, 2).T):
+        features = [response_features(some["magnitudes"][row], some["first_path_index"][row]) for row in rows]
+        for k, values in enumerate(np.array(features).reshape(-1, 2).T):
             means = _means(which, values, len(exchanges))
             found[:, k] = np.where(np.isfinite(means), means, found[:, k])
     return found
 
 
 def _responses(source: object) -> Iterable[Columns]:
-    """Yield the impulse responses of a source as columns, those of a recording some at a time: each has 2 kB."""
+    """Yield the impulse responses of a source as columns; those of a recording in blocks, because each has 2 kB."""
     recording = getattr(source, "recording", None)
     if isinstance(recording, Recording):
         edges = recording.dividing_times("cirs", 2000)
@@ -74,9 +79,10 @@ def _column(values: list[Any]) -> NDArray[Any]:
 
 
 def _exchange_of(exchanges: Exchanges, rows: Columns) -> tuple[Ints, Ints]:
-    """Return which rows belong to an exchange (m,), and the exchange of each: the last one of their pair before them.
+    """Return the rows (m,) of impulse responses that belong to an exchange, and the exchange of each (m,).
 
-    Boards print a response after its exchange, in MILUV 0.13 s in the median: it may be 0.4 s late, and 10 ms early.
+    It is the last exchange of the pair before the response, at most 0.4 s ago. Boards print a response after its
+    exchange, in MILUV with a median delay of 0.13 s. A response may have a time up to 10 ms before its exchange.
     """
     pairs, time_ns = _pairs(exchanges.initiator, exchanges.target), exchanges.time_ns
     order = np.lexsort((time_ns, pairs))
@@ -96,7 +102,7 @@ def _pairs(initiator: Ints, target: Ints) -> Ints:
 
 
 def _means(which: Ints, values: Floats, count: int) -> Floats:
-    """Return the mean of finite values (m,) by the exchange that they belong to (count,), NaN without any."""
+    """Return the mean of the finite values (m,) of each exchange (count,), NaN without any; `which` (m,) numbers it."""
     known = np.isfinite(values)
     total, number = np.bincount(which[known], values[known], count), np.bincount(which[known], minlength=count)
     return np.where(number > 0, total / np.maximum(number, 1), np.nan)

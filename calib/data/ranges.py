@@ -1,4 +1,4 @@
-"""Ranges with their true distances, as the columns that a calibration works with."""
+"""Ranges with their true distances, as columns."""
 
 from __future__ import annotations
 
@@ -30,54 +30,58 @@ from uwblink.twr import Exchanges, delay_weights, names_in, range_ns, raw_range,
 MapSource = str | os.PathLike[str] | Mapping[str, Any]
 
 IN_MEMORY: Final = "memory"
-"""The source of ranges that come from no file."""
+"""Source of ranges that are not from a file."""
 
 NO_STAMPS: Final = "range"
-"""The protocol of a range that came without stamps."""
+"""Protocol of ranges without stamps."""
 
 STATIC: Final = "static"
-"""The reason for which `without_static` leaves ranges out."""
+"""Reason for ranges that `without_static` leaves out."""
 
 FEATURES: Final = ("response_db", "rise_taps")
-"""Features of impulse responses that indicate a reflection: their energy over that of the first path, in dB, and the
-number of taps in which the first path rises from the noise to its peak. Of an exchange they are means over receptions.
+"""Features of impulse responses that indicate a reflection: their energy relative to that of the first path, in dB, and
+the number of taps in which the first path rises from the noise to its peak. Those of an exchange are means over its
+receptions.
 
-Two others were tried. The distance beside the power made predictions worse in 24 simulated rooms left out one by one.
-Total less first-path power by the chip had a slope of the wrong sign in the public table that has both (Hanyang), and
-made predictions of its held-out ranges worse.
+Two others were tried and rejected. Distance in addition to power made predictions worse in 24 simulated rooms, each
+predicted from the others. The chip's total power minus first-path power had a slope of the wrong sign in the public
+table that has both (Hanyang), and made predictions of its held-out ranges worse.
 """
 
 MAX_RANGE_M: Final = 1e4
-"""Longer ranges come from impossible stamps or another unit: no ultra-wideband radio reaches a tenth of it."""
+"""Largest range that is used. Larger ones come from wrong stamps or another unit: ultra-wideband radios reach less than
+a tenth of it."""
 
 LEAST_TURN_RAD: Final = math.radians(45.0)
-"""Angle by which the attitudes of a body differ that turns: a hovering drone tilts by less (a judgement)."""
+"""Smallest angle between attitudes of a body that turns. A hovering drone tilts by less (a judgement)."""
 
 FAINTEST_DBM, LOUDEST_DBM = -140.0, -30.0
-"""Received powers lie between these bounds; a board that cannot tell a strong power prints 0."""
+"""Bounds of received powers (judgements); other values are not measurements. A board prints 0 for a power that it could
+not measure."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Ranges(ColumnTable):
     """Ranges with their true distances as columns of length n; `from_exchanges` and `from_arrays` make them.
 
-    `raw_m` is the range recomputed from the stamps, `truth_m` the distance between the antennas; `weight_initiator` and
+    `raw_m` is the range computed from the stamps, `truth_m` the distance between the antennas; `weight_initiator` and
     `weight_target` are the derivatives of the calibrated time of flight by the antenna delays of the two tags.
-    `protocol` is "range" where a range came without stamps. `session` numbers the sessions (n,), whose names are
-    `sessions`: joined recordings, of which those that ran at the same time count as one.
+    `protocol` is "range" for ranges without stamps. `session` (n,) is the number of each range's session, and
+    `sessions` are their names: each recording is a session, except that recordings at the same time are one.
 
-    `excluded` counts by reason the ranges that were left out; `planted` is what a simulation put in, for display only;
-    `recordings` are names and fingerprints of the recordings, empty for ranges of arrays; `left_skew` is what clock
-    skew may have left in single-sided ranges, None without any; `bodies` are tags with the body that carries each;
-    `antenna_delays` are those programmed into the tags, as far as known; `arrivals` is what other tags overheard of
-    these exchanges, None without any. `toward` (n, 2, 3) are unit vectors from the antennas of initiator and target to
-    each other, in the frames of their bodies, NaN where attitudes are not known; `turning` are tags whose bodies turn.
-    `temperature_c` (n, 2) are the temperatures of initiator and target, NaN where no reading is near in time;
-    `features` (n, 2) are the `FEATURES` of their receptions, NaN where unknown.
-    `supply_v_per_k` is by how much the supply of a tag changes with its temperature, where it reads both.
+    `excluded` counts the ranges that were left out, by reason; `planted` are the parameters of a simulation, for
+    display only; `recordings` are names and fingerprints of the recordings, empty for ranges of arrays; `left_skew` are
+    errors of single-sided ranges by clock skew, None without such ranges; `clocks_apart` is the pair whose clock skews
+    by stamps and by carriers differ most, None if all agree; `bodies` are pairs of a tag and its body; `antenna_delays`
+    are those programmed into the tags, if known; `arrivals` are the differences of arrival at tags that overheard these
+    exchanges, None without any. `toward` (n, 2, 3) are unit vectors from the antennas of initiator and target to each
+    other, in the frames of their bodies, NaN if attitudes are unknown; `turning` are the tags on bodies that turn.
+    `temperature_c` (n, 2) are the temperatures of initiator and target, NaN without a reading near in time;
+    `features` (n, 2) are the `FEATURES` of their receptions, NaN if unknown. `supply_v_per_k` is the change of a tag's
+    supply voltage per kelvin, for tags that measure both.
 
-    A row with a `listener` (-1 elsewhere) is a difference of arrival without stamps: by how much farther from the
-    target than from the initiator the listener is. The weight of its initiator is negative.
+    A row with a `listener` (-1 in others) is a difference of arrival without stamps: the listener's distance to the
+    target minus its distance to the initiator. The weight of its initiator is negative.
     """
 
     source: str
@@ -109,7 +113,7 @@ class Ranges(ColumnTable):
     listener: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
-        """Put all ranges into one session, and take what is known of their ends for unknown, where nothing is given."""
+        """Fill missing columns: one session, no listeners, unknown directions, temperatures and features."""
         if len(self.listener) != len(self.time_ns):
             object.__setattr__(self, "listener", np.full(len(self.time_ns), -1))
         if len(self.session) != len(self.time_ns):
@@ -131,11 +135,11 @@ class Ranges(ColumnTable):
         antenna_delays: AntennaDelays | None = None,
         temperature: Mapping[str, NDArray[Any]] | None = None,
     ) -> Ranges:
-        """Return a row for every exchange, usable or not (`usable` leaves out those that a fit cannot use).
+        """Return a row for every exchange; `usable` leaves out those that a fit cannot use.
 
-        True distances are `truth_m` (n,), or those of the exchanges; where neither is finite they come from `poses` and
-        the lever arms of `tags`. A power that cannot have been measured is NaN. `temperature` are readings, the columns
-        of a recording's table. Raises `BadInputError` where `truth_m` has another length than the exchanges.
+        True distances are `truth_m` (n,), by default those of the exchanges. If they are not finite, they are computed
+        from `poses` and the lever arms of `tags`. Impossible powers become NaN. `temperature` has the columns of a
+        recording's table. Raises `BadInputError` if `truth_m` has another length than the exchanges.
         """
         truth = exchanges.truth_m if truth_m is None else np.asarray(truth_m, dtype=np.float64)
         if truth.shape != (len(exchanges),):
@@ -145,7 +149,7 @@ class Ranges(ColumnTable):
             tracks = tracks_of(poses)
             distance, toward = sights(tracks, tags, exchanges.initiator, exchanges.target, range_ns(exchanges))
             truth = np.where(np.isfinite(truth), truth, distance)
-            # Tables of places have no attitudes: those of their poses are (0, 0, 0, 1) throughout.
+            # Tables of positions have no attitudes: all of their poses have (0, 0, 0, 1), which are no directions.
             placed = [tag for tag in tags if tag.body in tracks and not any(tag.lever_arm_m)]
             blind = [tag.tag for tag in placed if not tracks[tag.body].columns[3:6].any()]
             toward[np.isin(np.column_stack([exchanges.initiator, exchanges.target]), blind)] = np.nan
@@ -197,14 +201,15 @@ class Ranges(ColumnTable):
         features: Mapping[str, ArrayLike] | None = None,
         source: str = IN_MEMORY,
     ) -> Ranges:
-        """Return a row for every range of arrays (n,), metres and dBm; a single number serves all rows.
+        """Return a row for every range, from arrays (n,) in metres and dBm; a single number applies to all rows.
 
-        `truth_m` and `time_ns` are needed to fit, and not to correct; powers where there is a curve. A single power per
-        range is `fpp1_dbm`. `weights` are those of the two delays (`uwblink.twr.delay_weights`): by default halves, as
-        if both clocks ran alike, which changes no range by more than a hundredth of a millimetre. `azimuth_deg` and
-        `elevation_deg` are the directions from the antennas of initiator and target to each other, in the frames of
-        their bodies; only a direction pattern needs them. `temperature_c` are the temperatures of both, `features` some
-        of `FEATURES` by name. Raises `BadInputError` where the arrays do not fit each other, and for unknown features.
+        `truth_m` and `time_ns` are needed to fit, not to correct; powers are needed if there is a curve. A single power
+        per range is `fpp1_dbm`. `weights` are those of the two delays (`uwblink.twr.delay_weights`); the default, one
+        half each, assumes equal clock rates, which changes a range by less than 0.01 mm per ns of delay. `azimuth_deg`
+        and `elevation_deg` are the directions from the antennas of initiator and target to each other, in the frames of
+        their bodies, needed only by patterns over direction. `temperature_c` are the temperatures of initiator and
+        target, `features` some of `FEATURES` by name. Raises `BadInputError` if the arrays do not have equal lengths,
+        for a tag at both ends, impossible temperatures, and unknown protocols and features.
 
         >>> from calib import Ranges
         >>> len(Ranges.from_arrays([3.1, 4.2], initiator=1, target=[2, 3], fpp1_dbm=-85.0))
@@ -212,9 +217,9 @@ class Ranges(ColumnTable):
         """
         if protocol not in PROTOCOLS:
             raise BadInputError(f"found {protocol!r:.40}, allowed: {', '.join(PROTOCOLS)}", parameter="protocol")
-        told = dict.fromkeys(FEATURES, math.nan) | dict(features or {})
-        if len(told) > len(FEATURES):
-            raise BadInputError(f"found {[*told][-1]!r:.40}, allowed: {', '.join(FEATURES)}", parameter="features")
+        given = dict.fromkeys(FEATURES, math.nan) | dict(features or {})
+        if len(given) > len(FEATURES):
+            raise BadInputError(f"found {[*given][-1]!r:.40}, allowed: {', '.join(FEATURES)}", parameter="features")
         angles = {"azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
         both = {"temperature_c": temperature_c} | angles
         for name, pair in ({"weights": weights} | both).items():
@@ -227,7 +232,7 @@ class Ranges(ColumnTable):
             "fpp2_dbm": math.nan if fpp2_dbm is None else fpp2_dbm,
             **dict(zip(("weight_initiator", "weight_target"), weights, strict=True)),
             **{f"{name} {end}": pair[end] for name, pair in both.items() for end in (0, 1)},
-            **told,
+            **given,
         }
         ints = {"initiator": initiator, "target": target, "time_ns": time_ns}
         with raising(BadInputError, "arrays of ranges have different lengths", TypeError, ValueError):
@@ -244,8 +249,8 @@ class Ranges(ColumnTable):
         columns |= {name: measured_powers(columns[name]) for name in ("fpp1_dbm", "fpp2_dbm")}
         warm, around, up = (np.array([columns.pop(f"{name} {end}") for end in (0, 1)]).T for name in both)
         columns["temperature_c"], around, up = measured_c(warm), np.radians(around), np.radians(up)
-        if len(lost := warm[~np.isnan(warm) & np.isnan(columns["temperature_c"])]):
-            raise BadInputError(f"found {lost[0]:g}, expected degrees Celsius, -65 to 150", parameter="temperature_c")
+        if len(wrong := warm[~np.isnan(warm) & np.isnan(columns["temperature_c"])]):
+            raise BadInputError(f"found {wrong[0]:g}, expected degrees Celsius, -65 to 150", parameter="temperature_c")
         toward = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1)
         columns["features"] = np.array([columns.pop(name) for name in FEATURES], dtype=np.float32).T
         found = cls(source=source, protocol=np.full(len(rows[0]), protocol), excluded={}, planted=None, **columns)
@@ -255,12 +260,12 @@ class Ranges(ColumnTable):
 
     @classmethod
     def from_dataframe(cls, frame: Any, map: MapSource | None = None) -> Ranges:  # noqa: A002 - what it is called elsewhere
-        """Return the ranges of a data frame, in order of time: of pandas or Polars, or another with Arrow's interface.
+        """Return the ranges of a data frame of pandas, Polars, or another with Arrow's interface, in order of time.
 
-        Its rows are exchanges, messages or ranges, as of tables that `uwblink import csv` reads. `map` explains its
-        columns, as a file or a mapping with the keys of a column map, such as `{"columns": {"range_m": "dist"}}`; by
-        default they are guessed. What the import noted (ids that are words, units) is a warning of Python. Raises
-        `BadInputError` for what it does not tell, and what `usable` left out.
+        Its rows are exchanges, messages or ranges, as in tables for `uwblink import csv`. `map` is a column map, as a
+        path or a mapping with its keys, such as `{"columns": {"range_m": "dist"}}`; without it, the meaning of columns
+        is guessed. Notes of the import, for example on units, are Python warnings. The result has all rows, also those
+        that `usable` leaves out. Raises `BadInputError` if the import fails.
 
         >>> import calib
         >>> flight = calib.load_ranges(calib.sample_flight())
@@ -278,19 +283,19 @@ class Ranges(ColumnTable):
     def from_differences(
         cls, table: Mapping[str, NDArray[Any]], *, poses: Poses, tags: Sequence[Tag], source: str = IN_MEMORY
     ) -> Ranges:
-        """Return a row for every difference of arrival without stamps, columns of the table `differences`.
+        """Return a row for every difference of arrival without stamps, from the columns of the table `differences`.
 
-        It depends on half the difference of both anchors' delays, as with stamps (`calib.data.arrivals`): anchors that
-        keep a common time measure their distances with the same delays, and a delay is half of transmission. The
-        smaller id is the initiator. Raises `BadInputError` for an anchor without a place, and where `poses` show that
-        all differences have the other sign or another unit.
+        A difference contains half of the difference of both anchors' delays: anchors that keep a common time measure
+        their distances with the same delays, and half of a delay belongs to transmission. The anchor with the smaller
+        id is the initiator. Raises `BadInputError` for an anchor without position, an anchor at both ends, and if
+        `poses` show that the differences have the wrong sign or another unit.
         """
         first, second = np.minimum(table["minus"], table["plus"]), np.maximum(table["minus"], table["plus"])
         places = set(names_in(poses.body))
-        lost = np.setdiff1d(np.append(first, second), [tag.tag for tag in tags if tag.body in places])
-        if len(lost):
+        unplaced = np.setdiff1d(np.append(first, second), [tag.tag for tag in tags if tag.body in places])
+        if len(unplaced):
             raise BadInputError(
-                f"{source}: differences of arrival contain anchor {lost[0]}, which has no position: give it with "
+                f"{source}: differences of arrival contain anchor {unplaced[0]}, which has no position: give it with "
                 f"`uwblink poses --tags`, or remove the anchor from the log"
             )
         if (itself := first == second).any():
@@ -306,11 +311,11 @@ class Ranges(ColumnTable):
             source=source,
         )
         beyond_m = np.abs(found.raw_m) - distances_m(poses, tags, first, second, table["time_ns"])
-        # Within pairs, because constants of a few pairs may follow their differences.
+        # Compare within pairs: with few pairs, constants of pairs may be correlated with their mean differences.
         pair, known = pairs_of(first, second).number, np.isfinite(found.raw_m) & np.isfinite(found.truth_m)
         within = (less_medians(lengths[known], pair[known]) for lengths in (found.raw_m, found.truth_m))
         fault = growth_fault("differences of arrival", *within)
-        # Without poses of the listener: no difference is longer than the way between both anchors.
+        # Without poses of the listener: a difference is at most the distance of both anchors.
         if fault or np.count_nonzero(beyond_m > LARGEST_ERROR_M) > len(found) / 2:
             raise BadInputError(
                 f"{source}: by its poses "
@@ -322,7 +327,7 @@ class Ranges(ColumnTable):
 
     @property
     def differences(self) -> Bools:
-        """Return which rows (n,) are differences of arrival without stamps."""
+        """Mask (n,) of rows that are differences of arrival without stamps."""
         return np.asarray(self.listener >= 0)
 
     def __getitem__(self, rows: int | slice | Bools | Ints) -> Ranges:
@@ -331,7 +336,7 @@ class Ranges(ColumnTable):
         return found if self.arrivals is None else replace(found, arrivals=self.arrivals.of_exchanges(rows, len(self)))
 
     def to_dict(self) -> dict[str, NDArray[Any]]:
-        """Return the columns by name, (n,) each, without directions, temperatures, features and listeners."""
+        """Return the columns (n,) by name, without directions, temperatures, features and listeners."""
         hidden = ("toward", "temperature_c", "features", "listener")
         return {name: column for name, column in self._columns().items() if name not in hidden}
 
@@ -340,11 +345,11 @@ class Ranges(ColumnTable):
         return f"Ranges of {self.source}: {len(self)} of tags {', '.join(map(str, self.tags()))}{left}"
 
     def __repr__(self) -> str:
-        """Return how many ranges of which tags there are, and what was left out."""
+        """Return source, number of ranges, tags, and counts of ranges that were left out."""
         return f"<{self._title()}>"
 
     def _repr_html_(self) -> str:
-        """Return the table, and a figure of the errors over time, or of the ranges where no truth is known."""
+        """Return the table, and a figure of errors over time; of ranges over time if no true distance is known."""
         from uwblink.pages.figures import notebook_image, values_over_time
 
         errors, name = 100 * (self.raw_m - self.truth_m), "raw range minus true distance (cm)"
@@ -353,17 +358,17 @@ class Ranges(ColumnTable):
         return ColumnTable._repr_html_(self) + notebook_image(draw, f"{name} over time")
 
     def tags(self) -> list[int]:
-        """Return the ids of the tags that range, in order."""
+        """Return the ids of initiators and targets, in ascending order."""
         return np.flatnonzero(np.bincount(np.append(self.initiator, self.target))).tolist()
 
     def usable(
         self, why_no_truth: str = "", why_no_power: str = "", *, need_power: bool = True, need_truth: bool = True
     ) -> Ranges:
-        """Leave out and count ranges of a tag with itself, without true distance, power, or a range within 10 km.
+        """Return the usable ranges, and count the others in `excluded`, each by its first reason.
 
-        A range counts for the first of these. Without `need_power`, ranges without power stay, and without
-        `need_truth` those without true distance. Raises `UnanswerableError` where nothing is left, with `why_no_truth`
-        or `why_no_power` where that is the reason.
+        Unusable ranges are those of a tag with itself, those without a true distance (if `need_truth`), those without
+        any power (if `need_power`), and those that are not finite or longer than 10 km. Raises `UnanswerableError` if
+        none remains; the text includes `why_no_truth` or `why_no_power` if most ranges lack it.
         """
         good = {
             "a tag with itself": self.initiator != self.target,
@@ -393,13 +398,17 @@ class Ranges(ColumnTable):
 
 
 def growth_fault(what: str, raw_m: Floats, truth_m: Floats) -> str:
-    """Return why lengths (n,), called `what`, cannot have these true values: another unit or sign; else ""."""
-    # The line of a few points is chance.
+    """Return a text if lengths (n,) have another unit or sign than their true values (n,), else "".
+
+    `what` names the lengths in the text.
+    """
+    # The slope of fewer points is too uncertain (a judgement).
     if len(raw_m) < 20:
         return ""
     slope = _robust_slope(truth_m, raw_m)
     rest = robust_spread(raw_m - slope * truth_m)
-    # A foot is 0.305 m, and ranges that follow other distances grow by anything.
+    # Other units have ratios of 0.305 (feet) or less, and 3.28 or more. If the line explains less than three times the
+    # rest, the lengths do not depend on these true values, and the slope is arbitrary.
     if 0.75 < slope < 1.35 or abs(slope) * robust_spread(truth_m) < 3.0 * rest:
         return ""
     guesses = ["they have the wrong sign" if slope < 0 else "", look_like("they", abs(slope))]
@@ -409,8 +418,8 @@ def growth_fault(what: str, raw_m: Floats, truth_m: Floats) -> str:
 def look_like(what: str, ratio: float) -> str:
     """Return a guess of the unit of lengths from their ratio to the true ones, "" if no unit is near."""
     whose, smaller = ("true distances", ratio) if ratio < 1 else (what, 1 / ratio)
-    # Units are apart by factors of three or more, and delays change a range of metres by less than a fifth.
-    # A nanosecond of flight is 0.300 m.
+    # A foot is 0.305 m, a nanosecond of flight 0.300 m. Units differ by factors of three or more, and delays change a
+    # range of metres by less than a fifth, so a ratio within 20 % (0.2 in its logarithm) identifies the unit.
     units = {0.001: "millimetres", 0.01: "centimetres", 0.3: "feet or nanoseconds"}
     near = (
         f"{whose} are probably {unit}" for own, unit in units.items() if abs(np.log(max(smaller, 1e-9) / own)) < 0.2
@@ -419,7 +428,7 @@ def look_like(what: str, ratio: float) -> str:
 
 
 def _robust_slope(x: Floats, y: Floats) -> float:
-    """Return how y (n,) grows with x (n,): the median slope between thirds (Tukey's line)."""
+    """Return the slope of y (n,) over x (n,) between the medians of the outer thirds (Tukey's resistant line)."""
     order = np.argsort(x, kind="stable")
     third = max(len(x) // 3, 1)
     low, high = order[:third], order[-third:]
@@ -428,7 +437,7 @@ def _robust_slope(x: Floats, y: Floats) -> float:
 
 
 def contents_of_frame(frame: Any, map_source: MapSource | None = None) -> Contents:
-    """Return what a data frame holds, imported as a table; raises `BadInputError`. Notes are warnings of Python."""
+    """Import a data frame as a table; notes of the import become Python warnings. Raises `BadInputError`."""
     from uwblink.importers import read_source
 
     try:
@@ -441,10 +450,10 @@ def contents_of_frame(frame: Any, map_source: MapSource | None = None) -> Conten
 
 
 def read_c(table: Mapping[str, NDArray[Any]], ids: Ints, time_ns: Ints) -> NDArray[np.float32]:
-    """Return the temperatures of tags `ids` (n, 2) at times (n,) by readings, columns of a table `temperature`.
+    """Return the temperatures of tags `ids` (n, 2) at times (n,), from the columns of a table `temperature`.
 
-    Interpolated linearly between readings, and held before the first and after the last; NaN further than 30 s from
-    the next reading: boards warm up within a minute or more, so that less than half of a change is missed.
+    Readings are interpolated linearly, and held before the first and after the last. More than 30 s from the nearest
+    reading, the temperature is NaN: boards need a minute or more to warm up, so less than half of a change is missed.
     """
     found = np.full(ids.shape, np.nan, dtype=np.float32)
     known = np.isfinite(measured_c(table["temperature_c"]))
@@ -460,7 +469,7 @@ def read_c(table: Mapping[str, NDArray[Any]], ids: Ints, time_ns: Ints) -> NDArr
 
 
 def _supply_v_per_k(table: Mapping[str, NDArray[Any]]) -> tuple[tuple[int, float], ...]:
-    """Return by how much the supply of tags changes with their temperature, V/K, by least squares over readings."""
+    """Return pairs of a tag and the slope of its supply voltage over temperature, in V/K, by least squares."""
     celsius, volts = measured_c(table["temperature_c"]).astype(np.float64), table["supply_v"]
     found = []
     for tag in np.unique(table["tag"]).tolist():
@@ -472,12 +481,12 @@ def _supply_v_per_k(table: Mapping[str, NDArray[Any]]) -> tuple[tuple[int, float
 
 
 def measured_c(temperature_c: Floats) -> NDArray[np.float32]:
-    """Return temperatures in degrees Celsius, NaN where no chip can even be stored (DW1000 data sheet)."""
+    """Return temperatures in degrees Celsius, NaN outside the chip's storage range, -65 to 150 (DW1000 data sheet)."""
     return np.where(np.abs(temperature_c - 42.5) <= 107.5, temperature_c, np.nan).astype(np.float32)
 
 
 def measured_powers(fpp_dbm: Floats) -> Floats:
-    """Return first-path powers (n,) in dBm, NaN where the number cannot be one."""
+    """Return first-path powers (n,) in dBm, NaN outside `FAINTEST_DBM` to `LOUDEST_DBM`."""
     with np.errstate(invalid="ignore"):
         return np.where((fpp_dbm < LOUDEST_DBM) & (fpp_dbm > FAINTEST_DBM), fpp_dbm, np.nan)
 
@@ -485,7 +494,7 @@ def measured_powers(fpp_dbm: Floats) -> Floats:
 def concatenate(parts: Sequence[Ranges]) -> Ranges:
     """Join the ranges of several recordings, in their order.
 
-    Raises `BadInputError` where other antenna delays were programmed into a tag in one of them than in another.
+    Raises `BadInputError` if a tag had different programmed antenna delays in two recordings.
     """
     session, names = _sessions(parts)
     skews = [part.left_skew for part in parts if part.left_skew]
@@ -499,7 +508,7 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
         left_skew=max(skews, key=lambda one: one.bound_m, default=None),
         clocks_apart=max(apart, key=lambda one: one.moves_m, default=None),
         recordings=tuple(one for part in parts for one in part.recordings),
-        # A tag that changes its body belongs to none.
+        # If a tag was on different bodies, no tag has a known body.
         bodies=tuple(sorted(bodies)) if len({tag for tag, _ in bodies}) == len(bodies) else (),
         turning=tuple(sorted({tag for part in parts for tag in part.turning})),
         supply_v_per_k=tuple(sorted({tag: slope for part in parts for tag, slope in part.supply_v_per_k}.items())),
@@ -511,7 +520,7 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
 
 
 def _arrivals_of_all(parts: Sequence[Ranges]) -> Arrivals | None:
-    """Return the differences of arrival of recordings that are joined, None where no recording has any."""
+    """Return the differences of arrival of all recordings, with exchanges numbered anew; None without any."""
     first = np.cumsum([0, *map(len, parts)]).tolist()
     found = [
         replace(part.arrivals, exchange=part.arrivals.exchange + start)
@@ -537,14 +546,17 @@ def _antenna_delays_of_all(parts: Sequence[Ranges]) -> AntennaDelays:
 
 
 def of_host_clock(time_ns: int) -> bool:
-    """Return whether a time counts from 1970, as that of a host does (`uwblink record`); others count from a start."""
+    """Return whether a time counts from 1970, as host time of `uwblink record`, instead of from a start.
+
+    Times above 20 years count from 1970.
+    """
     return time_ns > 20 * 365 * 86_400 * 1_000_000_000
 
 
 def _sessions(parts: Sequence[Ranges]) -> tuple[Ints, tuple[str, ...]]:
-    """Return the session of each range of recordings that are joined (n,), and the names of the sessions.
+    """Return the session of each range of all recordings (n,), and the names of the sessions.
 
-    Recordings that ran at the same time, by the clocks of their hosts, are one session.
+    Recordings whose host times overlap are one session.
     """
     number, names, ends = list[Ints](), list[str](), list[tuple[int, int]]()
     for part in parts:
@@ -564,10 +576,9 @@ def _sessions(parts: Sequence[Ranges]) -> tuple[Ints, tuple[str, ...]]:
 
 
 def without_static(ranges: Ranges, *, span_s: float = 2.0, within_m: float = 0.02) -> Ranges:
-    """Leave out spans of two seconds in which a pair's distance stays within two centimetres.
+    """Leave out spans of `span_s` seconds in which the distance of a pair changes by at most `within_m` metres.
 
-    A flight that waits on the ground repeats one geometry, and with it one error. Raises `UnanswerableError` where
-    nothing ever moves.
+    Bodies that stand still repeat one geometry, and with it one error. Raises `UnanswerableError` if nothing moves.
     """
     span = (ranges.time_ns - ranges.time_ns.min()) // int(span_s * 1e9)
     pairs = pairs_of(ranges.initiator, ranges.target)
@@ -582,9 +593,10 @@ def without_static(ranges: Ranges, *, span_s: float = 2.0, within_m: float = 0.0
 
 
 def held_out(ranges: Ranges, share: float, fold: str) -> Bools:
-    """Return which ranges (n,) are held out: evenly spread tenths of each session's time, pairs, or sessions.
+    """Return a mask (n,) of a share of the ranges to hold out, in whole parts that are evenly spread.
 
-    Raises `UnanswerableError` where that leaves nothing to fit or nothing to judge by.
+    With `fold` "time" parts are tenths of each session's time, with "pair" pairs of tags, with "session" sessions.
+    Raises `UnanswerableError` if nothing is left to fit, or nothing is held out.
     """
     if fold == "pair":
         unit = pairs_of(ranges.initiator, ranges.target).number

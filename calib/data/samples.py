@@ -1,4 +1,4 @@
-"""A small flight for examples and first steps, with known delays and curve; no simulator is needed for it."""
+"""A small synthetic flight for examples, with known delays and curve, without the simulator."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from uwblink.twr import Exchanges
 
 DELAYS_NS: Final = {1: -0.3, 2: 0.1, 3: -0.1}
 ANCHOR_DELAYS_NS: Final = DELAYS_NS | {4: 0.2, 5: 0.0}
-"""The planted delays of a flight without and with anchors."""
+"""Planted delays of the flights without and with anchors."""
 
 REPLY_TICKS: Final = 20_000_000
-"""Reply times, 0.3 ms: about those of the boards."""
+"""Reply time: 0.3 ms, as on the boards."""
 
 
 def sample_flight(count: int = 900, *, seed: int = 1, anchors: bool = False) -> Contents:
-    """Return `count` exchanges of three tags that move about a room, 100 a second, as a recording would hold them.
+    """Return `count` exchanges of three tags that move about a room, 100 per second, with poses and tags.
 
-    With `anchors` tag 1 alone moves, and tags 2 to 5 stand fixed and range among themselves, too. Antenna delays are
-    -0.3, 0.1, -0.1, 0.2 and 0 ns; ranges are 4 cm longer at the highest powers than at the lowest; the noise
+    With `anchors`, only tag 1 moves; tags 2 to 5 are fixed and also range with each other. The antenna delays of tags 1
+    to 5 are -0.3, 0.1, -0.1, 0.2 and 0 ns. Ranges are 4 cm longer at the highest powers than at the lowest; the noise
     is 3 cm. The same seed gives the same flight.
 
     >>> import calib
@@ -46,7 +46,7 @@ def sample_flight(count: int = 900, *, seed: int = 1, anchors: bool = False) -> 
     measured_m = measured_m - 0.5e-9 * SPEED_OF_LIGHT * (delay[initiator] + delay[target])
     tags = [Tag(int(tag), f"robot{tag}", (0.0, 0.0, 0.0)) for tag in np.unique(pair)]
     planted = {"delays_ns": {str(tag.tag): ANCHOR_DELAYS_NS[tag.tag] for tag in tags}}
-    # The boards' usual antenna delays were programmed.
+    # State that the boards' default antenna delays were programmed.
     meta = {"planted": planted, **meta_of_delays({None: AntennaDelay()})}
     # Poses 100 times a second, until a second after the last range.
     pose_ns = np.arange(0, int(time_ns[-1]) + 1_000_000_000, 10_000_000)
@@ -60,7 +60,7 @@ def sample_flight(count: int = 900, *, seed: int = 1, anchors: bool = False) -> 
 
 
 def stamped(time_ns: Any, pair: Any, measured_m: Floats, power: Floats) -> Exchanges:
-    """Return double-sided exchanges whose stamps give the measured ranges; all clocks run alike."""
+    """Return double-sided exchanges whose stamps give the measured ranges (n,) in metres; clock rates are equal."""
     there_and_back = np.rint(2 * measured_m / SPEED_OF_LIGHT / TICK_S).astype(np.int64)
     zero, nothing = np.zeros_like(time_ns), np.zeros(len(time_ns))
     return Exchanges(
@@ -85,7 +85,7 @@ def stamped(time_ns: Any, pair: Any, measured_m: Floats, power: Floats) -> Excha
 
 
 def _place(tag: Any, time_ns: Any, fixed: tuple[int, ...] = ()) -> Floats:
-    """Return the position of tags: each on its own slow figure about its own corner, or in the corner if `fixed`."""
+    """Return positions (n, 3) of tags in metres: each moves about its own corner, or stays there if it is `fixed`."""
     phase = 2e-9 * time_ns + 2.0 * tag
     corner = 2.0 * np.stack([np.cos(2.1 * tag), np.sin(2.1 * tag), 0.3 * tag], axis=-1)
     away = np.stack([np.sin(phase), np.cos(1.3 * phase), 0.5 * np.sin(0.7 * phase)], axis=-1)

@@ -1,4 +1,4 @@
-"""Sources of ranges: recordings, open ones, simulations in memory, or several of them."""
+"""Sources of ranges: paths of recordings, open recordings, simulations in memory, data frames."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ from uwblink.twr import Exchanges
 
 @runtime_checkable
 class Source(Protocol):
-    """An object in place of a file: exchanges, poses of bodies, and the tags on them.
+    """An object with exchanges, poses of bodies, and tags, such as the result of a simulation.
 
-    A simulation's result has these attributes. Used where they exist: `planted`, what a simulation put in, which is
-    shown and never used (or `meta` with that entry, and with the programmed antenna delays); `faults`; `overheard`,
-    `temperature` and `differences`, columns of the recording's tables; `cirs`, impulse responses.
+    Optional attributes: `planted`, parameters of a simulation, for display only; `meta`, with programmed antenna delays
+    and perhaps `planted`; `faults`; `overheard`, `temperature` and `differences`, columns of the recording's tables;
+    `cirs`, impulse responses.
     """
 
     @property
@@ -54,7 +54,7 @@ class Source(Protocol):
 
     @property
     def poses(self) -> Poses:
-        """Poses of the bodies; none where the exchanges carry their true distances."""
+        """Poses of the bodies; may be empty if the exchanges have true distances."""
 
     @property
     def tags(self) -> Sequence[Tag]:
@@ -62,7 +62,7 @@ class Source(Protocol):
 
 
 Data = str | os.PathLike[str] | Recording | Source | Exchanges | Ranges
-"""One recording: its path, an open one, a `Source`, exchanges with their distances, or ranges loaded before."""
+"""One recording: its path, an open `Recording`, a `Source`, exchanges with true distances, or `Ranges`."""
 
 
 READERS: Final[dict[str, Callable[[Recording], Any]]] = {
@@ -78,18 +78,18 @@ READERS: Final[dict[str, Callable[[Recording], Any]]] = {
     "arrangements": Recording.arrangements,
     "known_distances": Recording.known_distances,
 }
-"""What a recording holds, and the functions that read it."""
+"""Functions that read the parts of a recording, by the name of the part."""
 
 
 class RecordedSource:
-    """An open recording as a `Source` with all that `READERS` read."""
+    """An open recording as a `Source`, with all parts in `READERS` as attributes."""
 
     def __init__(self, recording: Recording) -> None:
         """Take a recording, which must stay open."""
         self.recording = recording
 
     def __getattr__(self, name: str) -> Any:
-        """Read a table when it is first used."""
+        """Read a part when it is first used."""
         if name not in READERS:
             raise AttributeError(name)
         self.__dict__[name] = READERS[name](self.recording)
@@ -98,9 +98,9 @@ class RecordedSource:
 
 @contextmanager
 def opened(data: Data) -> Iterator[tuple[str, Source]]:
-    """Yield a name and a `Source`, which can be used inside the block.
+    """Yield a name and a `Source`, which is valid inside the `with` block.
 
-    Raises the errors of `Recording.open`, and `BadInputError` for what is no recording at all.
+    Raises the errors of `Recording.open`, and `BadInputError` for an object of another type.
     """
     if isinstance(data, Recording):
         yield data.path.name, RecordedSource(data)
@@ -130,15 +130,15 @@ def _no_recording(data: object) -> BadInputError:
 def load_ranges(
     data: Data | Iterable[Data], *, trim_static: bool = False, need_power: bool = True, use: str = "exchanges"
 ) -> Ranges:
-    """Return the ranges of one or more recordings with their true distances, without those that cannot be used.
+    """Return the usable ranges of one or several recordings with their true distances.
 
     `data` is the path of a recording, an open `Recording`, `Exchanges` with their true distances, `Ranges`, a data
     frame (`Ranges.from_dataframe`), any object with `exchanges`, `poses` and `tags` (a simulation in memory), or
-    several of those. `trim_static` leaves out spans
-    of two seconds in which a pair's distance stays within two centimetres. Ranges without any power are left out unless
-    `need_power` is False. What other tags overheard of them is in `arrivals`; with `use` "receptions" differences of
-    arrival without stamps are rows, too. Raises the errors of `Recording.open`, and `UnanswerableError` where nothing
-    can be used.
+    several of these. `trim_static` leaves out spans of two seconds in which the distance of a pair changes by at most
+    two centimetres. Ranges without any power are left out unless `need_power` is False. Differences of arrival at tags
+    that overheard the exchanges are in `arrivals`; with `use` "receptions", differences of arrival without stamps are
+    rows. Raises the errors of `Recording.open`, `BadInputError` if a recording is given twice, and `UnanswerableError`
+    if no range is usable.
 
     >>> import calib
     >>> own = calib.Ranges.from_arrays([3.1, 4.2], initiator=1, target=2, fpp1_dbm=-85.0, truth_m=[3.0, 4.0])
@@ -152,9 +152,9 @@ def load_ranges(
 def load_each(
     data: Data | Iterable[Data], *, trim_static: bool = False, need_power: bool = True, use: str = "exchanges"
 ) -> list[Ranges]:
-    """Return the ranges of each recording; raises what `load_ranges` raises.
+    """Return the ranges of each recording; arguments and errors are those of `load_ranges`.
 
-    Raises `BadInputError` where two recordings hold the same exchanges: counted twice, they would seem to tell more.
+    Raises `BadInputError` if two recordings have the same exchanges, which would make intervals too small.
     """
     given = each(data)
     parts = [
@@ -173,11 +173,11 @@ def load_each(
 
 
 def each(data: Data | Iterable[Data]) -> list[Data]:
-    """Return one recording or several as a list; raises `BadInputError` where there is none."""
+    """Return one or several recordings as a list; raises `BadInputError` if there is none, and for other types."""
     one: Any = data
     if isinstance(data, str | os.PathLike | Recording | Ranges | Exchanges | Source) or is_frame(data):
         return [one]
-    # The names of a mapping are no paths.
+    # Iterating over a mapping would take its keys for paths.
     if not isinstance(data, Iterable) or isinstance(data, Mapping):
         raise _no_recording(data)
     found = list(data)
@@ -187,14 +187,17 @@ def each(data: Data | Iterable[Data]) -> list[Data]:
 
 
 def held_open(data: Data) -> AbstractContextManager[Data]:
-    """Return a context in which a file is open, so that it can be read more than once; raises what opening raises."""
+    """Return a context manager that gives an open recording for a path, and other data unchanged.
+
+    An open recording can be read several times. Raises the errors of `Recording.open`.
+    """
     if isinstance(data, str | os.PathLike):
         return Recording.open(data, memory_mb=256)
     return nullcontext(data)
 
 
 def antenna_delays_in(meta: Mapping[str, Any], source: str) -> AntennaDelays:
-    """Return the programmed antenna delays that `meta` states; raises `BadInputError` where it cannot be understood."""
+    """Return the programmed antenna delays in `meta`; raises `BadInputError` if their form is wrong."""
     try:
         return delays_in_meta(meta)
     except ValueError as error:
@@ -202,12 +205,12 @@ def antenna_delays_in(meta: Mapping[str, Any], source: str) -> AntennaDelays:
 
 
 def antenna_delays_of(source: Source, name: str) -> AntennaDelays:
-    """Return what was programmed into the tags of a source; raises what `antenna_delays_in` raises."""
+    """Return the antenna delays programmed into the tags of a source; raises the errors of `antenna_delays_in`."""
     return antenna_delays_in(getattr(source, "meta", None) or {}, name)
 
 
 def planted_of(source: Source, name: str) -> Mapping[str, Any] | None:
-    """Return what a simulation planted, None where nothing was; raises what `check_planted` raises."""
+    """Return the planted parameters of a simulation, None without any; raises the errors of `check_planted`."""
     found = getattr(source, "planted", None) or getattr(source, "meta", {}).get("planted")
     if not isinstance(found, Mapping):
         return None
@@ -216,7 +219,7 @@ def planted_of(source: Source, name: str) -> Mapping[str, Any] | None:
 
 
 def _why_no_power(exchanges: Exchanges) -> str:
-    """Return a text on impossible powers, if there are any: no receiver gets more than a milliwatt."""
+    """Return a text on powers outside the possible ones; "" if all powers are 0 or NaN, as of boards without powers."""
     given = np.concatenate([exchanges.fpp1_dbm, exchanges.fpp2_dbm])
     given = given[np.isfinite(given) & (given != 0)]
     if not len(given):
@@ -229,7 +232,7 @@ def _why_no_power(exchanges: Exchanges) -> str:
 
 
 def _why_no_truth(source: Source) -> str:
-    """Return how poses and exchanges lie in time, where no exchange has a true distance although there are poses."""
+    """Return why poses give no exchange a true distance: no tags, no poses of a body, other times; "" without poses."""
     poses, tags, time_ns = source.poses, source.tags, source.exchanges.time_ns
     if not len(poses) or not len(time_ns):
         return ""
@@ -247,7 +250,7 @@ def _why_no_truth(source: Source) -> str:
 
 
 def check_planted(planted: Mapping[str, Any], where: str) -> None:
-    """Raise `BadInputError`, beginning with `where`, for delays that are no numbers by tag and curves that are none."""
+    """Raise `BadInputError`, whose text starts with `where`, for planted delays and curves of a wrong form."""
     for key, (read, form) in FORMS.items():
         try:
             if planted.get(key) is not None:
@@ -268,7 +271,7 @@ def _curve(found: Any) -> None:
 
 
 def _numbers(values: ArrayLike) -> Floats:
-    """Return a list of numbers as an array (n,); raises an error where one is none or beyond 1e9 ns, m or mW."""
+    """Return a list of numbers as an array (n,); raises `ValueError` for NaN and for values beyond 1e9."""
     found = np.array(values, dtype=np.float64)
     if found.ndim != 1 or not (np.abs(found) <= 1e9).all():
         raise ValueError("not a list of usable numbers")
@@ -282,7 +285,7 @@ FORMS: Final = {"delays_ns": (_delays, "numbers by tag"), "bias_curve": CURVE, "
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """Ranges together with where bodies and tags were, and columns of tables of sensors by their names."""
+    """Ranges with poses and tags, and columns of tables of sensors by the table's name."""
 
     ranges: Ranges
     poses: Poses
@@ -290,13 +293,13 @@ class Flight:
     sensors: Mapping[str, Mapping[str, NDArray[Any]]] = field(default_factory=dict)
 
     def moving_bodies(self) -> list[str]:
-        """Return the bodies whose position changes by more than a decimetre."""
+        """Return the bodies whose position changes by more than 0.1 m along an axis."""
         tracks = {name: self.poses.position_m[self.poses.body == name] for name in np.unique(self.poses.body).tolist()}
         return [name for name, track in tracks.items() if np.ptp(track, axis=0).max() > 0.1]
 
 
 def require_times(ranges: Ranges) -> None:
-    """Raise `UnanswerableError` if all ranges have the same time, as those without recorded times."""
+    """Raise `UnanswerableError` if all ranges have the same time, as in tables without times."""
     if len(ranges) > 1 and not np.ptp(ranges.time_ns):
         raise UnanswerableError(
             f"{ranges.source}: all of its {len(ranges)} ranges have the same time, so tracking is impossible; import "
@@ -305,7 +308,7 @@ def require_times(ranges: Ranges) -> None:
 
 
 def require_arrivals(ranges: Ranges) -> None:
-    """Raise `UnanswerableError` if no tag overheard a range, and there are no differences of arrival without stamps."""
+    """Raise `UnanswerableError` if there are no differences of arrival, with or without stamps."""
     if (ranges.arrivals is None or not len(ranges.arrivals)) and not ranges.differences.any():
         raise UnanswerableError(
             f"{ranges.source}: no listener overheard an exchange between tags with known distances; record with "
@@ -322,14 +325,14 @@ def load_flight(
     use: str = "exchanges",
     sensors: Sequence[str] = (),
 ) -> Flight:
-    """Return a recording's usable ranges with its poses; of an exchange that both ends reported one report counts.
+    """Return the usable ranges of a recording with its poses and tags.
 
-    Without `need_truth` ranges and differences of arrival without true distances stay, also where no poses are.
-    With `use` "receptions" differences without stamps are rows, too. `sensors` name the tables of sensors that are
-    read, too.
+    If both ends reported an exchange, one report is used. With `need_truth` False, ranges and differences of arrival
+    without true distances are kept. With `use` "receptions", differences without stamps are rows. `sensors` are names
+    of tables to read as well.
 
-    Raises what `opened` raises, `BadInputError` for planted values or antenna delays that cannot be read, and
-    `UnanswerableError` where no range can be used.
+    Raises the errors of `opened`, `BadInputError` if planted values or antenna delays have a wrong form, and
+    `UnanswerableError` if no range is usable.
     """
     with opened(data) as (name, source):
         exchanges, warm = single_reports(source.exchanges).exchanges, getattr(source, "temperature", None)
@@ -346,7 +349,7 @@ def load_flight(
             text = f"{name}: no temperatures of ranging tags within 30 s of their ranges: they are not used"
             warn(text, TemperatureWarning)
         celsius = found.temperature_c[np.isfinite(found.temperature_c)]
-        # Boards in rooms are colder, and 45 °F are 7 °C.
+        # Boards in rooms are colder than 45 °C. If all readings are above 45, they are probably in °F (45 °F are 7 °C).
         if len(celsius) and celsius.min() > 45:
             read = f"{name}: temperatures are {celsius.min():.0f} to {celsius.max():.0f} °C"
             text = f"{read}; if they are degrees Fahrenheit, import them again as (F - 32) / 1.8"
@@ -373,7 +376,10 @@ def load_flight(
 def _with_differences(
     found: Ranges, bare: Mapping[str, NDArray[Any]], source: Source, *, need_power: bool, use: str
 ) -> Ranges:
-    """Return ranges, and with `use` "receptions" rows of a table `differences`."""
+    """Return ranges; with `use` "receptions" followed by the rows of a table `differences`.
+
+    Raises `UnanswerableError` if the differences would need powers, and if there is nothing else and they are not used.
+    """
     if use == "receptions":
         if need_power:
             raise UnanswerableError(
@@ -393,7 +399,10 @@ def _with_differences(
 def sensor_rows(
     table: Mapping[str, NDArray[Any]], body: str, names: Sequence[str], began_ns: int
 ) -> tuple[Floats, Floats]:
-    """Return times in seconds and columns (n, names) of a body's rows, in order of time, one for each time."""
+    """Return times in seconds (n,) since `began_ns`, and columns (n, names) of a body's rows in a table of sensors.
+
+    Rows are in order of time; of several rows with the same time, the first one is used.
+    """
     if not table:
         return np.zeros(0), np.zeros((0, len(names)))
     mine = np.flatnonzero(table["body"] == body)

@@ -1,4 +1,4 @@
-"""Reports as HTML and PDF, made of `Heading`, `Text`, `Table`, `Picture` and `Listing`; and figures as files."""
+"""Reports as HTML and PDF, composed of `Heading`, `Text`, `Table`, `Picture` and `Listing`; and figures as files."""
 
 from calib.report.campaign import (
     check_places,

@@ -1,6 +1,7 @@
-"""Reports and figures as files: of evaluations, of surveys, of tracks, of comparisons, and of whole campaigns.
+"""Reports and figures as files: of evaluations, surveys, tracks, comparisons, and campaigns.
 
-A campaign fits, examines, localizes and judges; one flight is fitted and judged for a sweep, too.
+A campaign fits a calibration, examines the recordings, localizes the bodies and evaluates the errors. `evaluate_flight`
+does the fit and the evaluation for a run of a sweep.
 """
 
 from __future__ import annotations
@@ -42,10 +43,11 @@ from uwblink.pages.blocks import Block, Document, Picture, write_document
 
 
 def check_places(output: Path | None, pdf: Path | None, figures: Path | None, *, force: bool) -> None:
-    """Check the output files of a report before anything is computed.
+    """Check the output files of a report.
 
-    Raises what `check_output` and, for a folder of `figures`, `check_folder` raise, and `BadInputError` for a `pdf`
-    that is the `output`, for endings other than .html, .htm and .pdf, and for a folder that holds figures already.
+    Raises the errors of `check_output` and, for the folder `figures`, of `check_folder`; `BadInputError` if `pdf` and
+    `output` are the same file, for suffixes other than .html, .htm and .pdf, and, without `force`, for a folder that
+    contains figures.
     """
     for name, path, allowed in (("output", output, (".html", ".htm", ".pdf")), ("pdf", pdf, (".pdf",))):
         if path is not None and path.suffix.lower() not in allowed:
@@ -73,12 +75,12 @@ def write_report(
     origin: Origin | None = None,
     force: bool = False,
 ) -> None:
-    """Evaluate a calibration on recordings and write what came out as one HTML file, or as PDF where it ends so.
+    """Evaluate a calibration on recordings and write a report, as one HTML file or as PDF (.pdf).
 
-    `data` is what `load_ranges` takes. `figures` is a folder for the figures at paper size (PDF and SVG); without a
-    `path` they are all that is written. An `evaluation` of the same recordings is taken instead of another one, and
-    `origin` as what the report says of where it comes from. Raises what `Calibration.apply`, `load_ranges` and
-    `check_output` raise; nothing is written then. The report of a whole campaign is `run_campaign(...).write(path)`.
+    `data` is as for `load_ranges`. `figures` is a folder for the figures at paper size (PDF and SVG); without a `path`
+    only these are written. `evaluation` is an existing evaluation of the same recordings, and `origin` the origin that
+    the report states; both are computed by default. Raises the errors of `Calibration.apply`, `load_ranges` and
+    `check_output`, and writes nothing then. For a fit with its report, use `run_campaign(...).write(path)`.
 
     >>> import calib, pathlib, tempfile
     >>> flight = calib.sample_flight(300)
@@ -93,17 +95,18 @@ def write_report(
     check_places(output, None, folder, force=force)
     recordings = each(data)
     loaded = load_each(recordings, need_power=calibration.needs_power)
-    made = origin or origin_of(recordings)
-    results = Results(calibration=calibration, tests=loaded, evaluated=evaluation, origin=made)
+    results = Results(
+        calibration=calibration, tests=loaded, evaluated=evaluation, origin=origin or origin_of(recordings)
+    )
     write_document(document(results, "Calibration report"), output, None, folder, force=force)
 
 
 def write_survey_report(
     path: str | os.PathLike[str], calibration: CalibrationSource, *, origin: Origin | None = None, force: bool = False
 ) -> None:
-    """Write what a calibration without known distances rests on and whether it is fit for use, as HTML or .pdf.
+    """Write a report of a calibration without known distances, as HTML or PDF (.pdf): its known facts and a verdict.
 
-    It needs no recording: everything stands in the calibration. Raises what `check_output` raises.
+    All data are from the calibration, without a recording. Raises the errors of `check_places`.
     """
     results = Results(calibration=given_calibration(calibration), origin=origin or origin_of([]))
     write_checked(document(results, "Report of a calibration without motion capture"), Path(path), force=force)
@@ -112,9 +115,9 @@ def write_survey_report(
 def write_track_figures(
     found: Sequence[Localization] | Sequence[OnboardTrack], folder: Path, *, force: bool = False
 ) -> None:
-    """Write each body's track into a folder, as PDF and SVG at two widths; of filters also bars of their RMSE.
+    """Write a figure of each body's track into a folder, as PDF and SVG at two widths.
 
-    Raises what `check_places` raises.
+    Results of `localize` also give a figure of the RMSE of all filters. Raises the errors of `check_places`.
     """
     compared = [one for one in found if isinstance(one, Localization)]
     draws: dict[type, Any] = {Localization: track, RelativePose: track, OnboardTrack: onboard}
@@ -133,7 +136,10 @@ def write_comparison_figures(
     *,
     force: bool = False,
 ) -> None:
-    """Write the differences of delays and both calibrations' curves into a folder; `names` label the calibrations."""
+    """Write figures of the differences of delays and of the curves of two calibrations, called `names`, into a folder.
+
+    Raises the errors of `check_places`.
+    """
     pictures: list[Block] = [
         Picture("differences", partial(drawings.differences, found=found), "Delays"),
         Picture("curves", partial(drawings.both_curves, known=known, names=names), "Curves"),
@@ -141,10 +147,10 @@ def write_comparison_figures(
     write_checked(Document("", pictures), None, folder, force=force)
 
 
-def write_checked(made: Document, output: Path | None, figures: Path | None = None, *, force: bool) -> None:
-    """Write a document and its figures where `check_places` allows it, and raise what that raises elsewhere."""
+def write_checked(page: Document, output: Path | None, figures: Path | None = None, *, force: bool) -> None:
+    """Write a document and its figures after `check_places`; raises the errors of that function."""
     check_places(output, None, figures, force=force)
-    write_document(made, output, None, figures, force=force)
+    write_document(page, output, None, figures, force=force)
 
 
 Progress = Callable[[str | float], None]
@@ -157,7 +163,7 @@ class Campaign(Results):
     fit: FitResult
 
     def __repr__(self) -> str:
-        """Return the fit, the recordings that judge it, and the findings."""
+        """Return the fit, the recordings on which it was evaluated, and the findings."""
         found = [f"{name}: {finding.fault}" for name, finding in self.findings]
         return "\n".join([repr(self.fit), f"judged on {self.judged.source}", *found])
 
@@ -170,21 +176,21 @@ class Campaign(Results):
         force: bool = False,
         progress: Progress = lambda _: None,
     ) -> None:
-        """Write the report as one HTML page, as PDF, and its figures at paper size (PDF and SVG) into a folder.
+        """Write the report as one HTML page and as PDF, and its figures (PDF and SVG) into a folder.
 
-        Figures come at two widths, a column's (3.5 inch) and a page's (7.16 inch). A `html` that ends in .pdf is a PDF.
-        `progress` is called with what is being done, and with the share that is done of this and of the fit and
-        evaluation before it. Raises the errors of `check_output` before anything is drawn.
+        Figures have two widths: of a column (3.5 inch) and of a page (7.16 inch). If `html` ends in .pdf, it is a PDF.
+        `progress` is called with the present step, and with the finished share of the campaign and its report. Raises
+        the errors of `check_output` before figures are drawn.
         """
         output, *more = (None if place is None else Path(place) for place in (html, pdf, figures))
         check_places(output, *more, force=force)
-        made = document(self, "Calibration of ultra-wideband ranges")
+        page = document(self, "Calibration of ultra-wideband ranges")
 
-        def tell(step: str | float) -> None:
-            # Shares are of the processor time for the flights of ICRA 2023, most of which goes into figures and tracks.
+        def report_step(step: str | float) -> None:
+            # Shares of processor time, measured with the flights of ICRA 2023.
             progress(step if isinstance(step, str) else 0.65 + 0.35 * step)
 
-        write_document(made, output, *more, force=force, progress=tell)
+        write_document(page, output, *more, force=force, progress=report_step)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib report --json` prints."""
@@ -220,14 +226,15 @@ def run_campaign(
     settings: FitSettings | None = None,
     **changes: Any,
 ) -> Campaign:
-    """Fit to the training recordings, judge and localize on the tests, and return all that a report tells of.
+    """Fit a calibration to training recordings, evaluate it and localize bodies on test recordings.
 
-    Recordings are what `load_ranges` takes, `settings` and keyword arguments what `fit` takes. Without tests a
-    second fit is judged on a part of the training that is held out from it (`FitSettings.hold_out`, 0.3 by default);
-    where that is too short, the training itself is judged. The report says which. `Ranges` alone are fitted and
-    judged, but neither examined nor localized: that takes a recording. `trim_static` leaves out of the training where
-    nothing moves; `progress` is called with what is being done, and with the share of a report's time that is over;
-    `command` is the command line that the report states. Raises what `load_ranges` and `fit` raise.
+    Recordings are as for `load_ranges`, `settings` and keyword arguments as for `fit`. Without tests, a second fit is
+    evaluated on a part of the training that is held out from it (`FitSettings.hold_out`, 0.3 by default); if the
+    training is too short for that, the errors are those of the fitted ranges. The report states which was done.
+    `Ranges` are fitted and evaluated, but examining and localizing need recordings. `trim_static` leaves out parts of
+    the training in which nothing moves; `progress` is called with the present step, and with the finished share of the
+    campaign and its report; `command` is the command line that the report states. Raises the errors of `load_ranges`
+    and `fit`.
 
     >>> import calib
     >>> campaign = calib.run_campaign(calib.sample_flight(), calib.sample_flight(300, seed=2), loss="huber")
@@ -261,7 +268,7 @@ def run_campaign(
             tests=testing if held is None else [held.ranges],
             part=None if held is None else held.calibration,
             fit=found,
-            # From the first recording that has passive listeners.
+            # Of the first recording with passive listeners.
             heard=next(filter(None, (heard_delays(data, known) for data in whole)), {}),
             findings=findings,
             tracks=[track for data in judged or recordings for track in _tracks(data, known)],
@@ -270,11 +277,11 @@ def run_campaign(
 
 
 def _fit_and_hold_out(ranges: Ranges, settings: FitSettings) -> FitResult:
-    """Fit with a part held out to judge by; without it if ranges are too few and `hold_out` was not asked for."""
+    """Fit with held-out ranges; if there are too few ranges and `hold_out` was not set, fit without."""
     if settings.hold_out:
         return fit(ranges, settings)
     try:
-        return fit(ranges, settings, hold_out=0.3)  # three of the tenths of `FitSettings.fold`
+        return fit(ranges, settings, hold_out=0.3)  # three of ten parts (`FitSettings.fold`)
     except UnanswerableError:
         return fit(ranges, settings)
 
@@ -283,12 +290,12 @@ def _findings(data: Data) -> list[tuple[str, Finding]]:
     if isinstance(data, Ranges):
         return []
     with opened(data) as (name, _):
-        # The fit warns of it already.
+        # The fit itself warns of too few pairs.
         return [(name, finding) for finding in examine(data) if finding.fault != "too few pairs"]
 
 
 def _tracks(data: Data, calibration: Calibration) -> list[Localization]:
-    """Localize in a recording; nothing if no body can be localized."""
+    """Localize the bodies of a recording; an empty list if none can be localized."""
     try:
         return [] if isinstance(data, Ranges) else localize(data, calibration)
     except UnanswerableError:
@@ -296,13 +303,13 @@ def _tracks(data: Data, calibration: Calibration) -> list[Localization]:
 
 
 def evaluate_flight(flight: Data) -> Mapping[str, Any]:
-    """Fit a flight and evaluate the fit on it; return the figures as one row of a sweep.
+    """Fit a flight and evaluate the fit on it; return the results as one row of a sweep.
 
-    `flight` is what `uwbsim.simulate` gives, or one of whatever else `load_ranges` takes. The row has the number of
-    `exchanges` that could be used; mean, standard deviation and robust spread in metres of the errors of `raw`,
-    `delays` and `full` ranges; `rejected`; and, compared with what was planted, `delays_rms_ns`, `curve_rms_m` and
-    `correction_rms_m`, None where nothing was; and `settled`, 0 where the fit stopped before it did. Raises
-    `UnanswerableError` where the flight cannot be fitted.
+    `flight` is a result of `uwbsim.simulate`, or another source of `load_ranges`. The row has the number of usable
+    `exchanges`; mean, standard deviation and robust spread, in metres, of the errors of `raw`, `delays` and `full`
+    ranges; `settled`, 1 if the fit converged, else 0; the share `rejected` of corrected ranges outside the 95 % bounds
+    of their sigma; and the differences from planted values, `delays_rms_ns`, `curve_rms_m` and `correction_rms_m`, None
+    if nothing was planted. Raises `UnanswerableError` if the flight cannot be fitted.
     """
     ranges = load_ranges(flight)
     result = fit(ranges)

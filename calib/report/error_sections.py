@@ -1,4 +1,4 @@
-"""Sections of a report on errors: over power, before and after correction, error model, localization, over time."""
+"""Sections of a report on errors: over power and direction, by pair and stage, error model, localization, over time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from uwblink.pages.figures import Draw
 
 
 def curves(results: Results) -> list[Block]:
-    """Return the curves over power with bands and data; without a recording as a table."""
+    """Return figures of the curves over power with bands and data; without a recording, a table of the curves."""
     calibration = results.calibration
     if not results.recordings:
         power, *curves = curve_rows(calibration)
@@ -50,13 +50,17 @@ def curves(results: Results) -> list[Block]:
 
 
 def _over_power(known: tuple[Any, Any, Any], which: Any) -> Draw:
-    """Return a function that draws a curve at a width; errors are binned once for all widths."""
+    """Return a function that draws a curve at a width. Errors are binned once for all widths."""
     found = cache(lambda: figures.over_power(*known, which))
-    return lambda width: figures.alone(lambda axes: figures.curve_over_power(*known, which, axes, found()), width)
+
+    def draw(axes: figures.Axes) -> figures.Axes:
+        return figures.curve_over_power(*known, which, axes, found())
+
+    return partial(figures.single_figure, draw)
 
 
 def patterns(results: Results) -> list[Block]:
-    """Return patterns over direction as a table and in a figure; nothing of a calibration that has none."""
+    """Return a table and a figure of patterns over direction; nothing if the calibration has none."""
     calibration = results.calibration
     if not calibration.patterns:
         return []
@@ -142,20 +146,20 @@ def outliers(results: Results) -> list[Block]:
     error = applied.corrected_m - ranges.truth_m
     z = error / applied.sigma_m
     groups = {**pair_rows(ranges), "all": np.ones(len(ranges), dtype=bool)}
-    told = {name: mine for name, mine in groups.items() if np.count_nonzero(mine) >= figures.MIN_RANGES_PER_BIN}
-    if not told:
+    fitted = {name: rows for name, rows in groups.items() if np.count_nonzero(rows) >= figures.MIN_RANGES_PER_BIN}
+    if not fitted:
         return []
-    parts = fit_grouped_errors([error[mine] for mine in told.values()])
+    parts = fit_grouped_errors([error[own] for own in fitted.values()])
     rows = [
         [
             name,
-            *(f"{100 * np.mean(side[mine]):.1f} %" for side in (z > 3, z < -3)),
+            *(f"{100 * np.mean(side[own]):.1f} %" for side in (z > 3, z < -3)),
             f"{100 * parts.sigma_m[k]:.1f}",
             f"{100 * parts.reflected[k]:.1f} %",
             f"{100 * parts.detour_m[k]:.0f}",
             f"{100 * parts.outliers[k]:.2f} %",
         ]
-        for k, (name, mine) in enumerate(told.items())
+        for k, (name, own) in enumerate(fitted.items())
     ]
     return [
         Heading("Outliers"),
@@ -173,7 +177,7 @@ def outliers(results: Results) -> list[Block]:
 
 
 def localization(results: Results) -> list[Block]:
-    """Return the RMSE by body and filter with the paper's values, and figures."""
+    """Return a table of the RMSE by body and filter with the values of ICRA 2023, and figures."""
     found = results.tracks
     if not found:
         return []

@@ -1,4 +1,4 @@
-"""Figures of localization and of plans, at a width in inches."""
+"""Figures of localization and of plans; each function returns a figure of a width in inches."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ FILTER_STYLES: Final[dict[str, tuple[str, str, Any, str]]] = {
 """Name, colour, dashes and hatches of each filter."""
 
 SAMPLES: Final = 700
-"""Points of a track that are drawn: more than the width of a page shows."""
+"""Largest number of points of a track that are drawn, about one per pixel of a page's width."""
 
 
 def rmse_bars(width_in: float, found: list[Localization]) -> Figure:
-    """Draw the RMSE of each body in each recording over seeds, and their mean."""
+    """Draw the RMSE of each body in each recording as the mean over seeds, and the mean over all bodies."""
     most, mean = 5 if width_in < NARROW_IN else 9, summarize(found).rmse_m
     shown = sorted(found, key=lambda one: -float(one.rmse_m["raw"].mean()))[:most] if len(found) > most else found
     figure, (axes,) = sheet(width_in, height_in=2.7)
@@ -43,7 +43,7 @@ def rmse_bars(width_in: float, found: list[Localization]) -> Figure:
         place = np.arange(len(names)) + 0.84 * ((k + 0.5) / len(mean) - 0.5)
         axes.bar(place, own, 0.76 / len(mean), color=colour, hatch=hatch, ec="white", lw=0, label=name)
     every = np.concatenate(list(heights.values()))
-    # A filter that diverged leaves the picture.
+    # Cut off the bar of a filter that diverged.
     if every.max() > 4 * np.quantile(every, 0.9):
         axes.set_ylim(0, 2.5 * np.quantile(every, 0.9))
         axes.text(0.99, 0.97, f"highest bar: {every.max():.2f} m", transform=axes.transAxes, ha="right", va="top")
@@ -70,9 +70,9 @@ def _label_paths(above: Axes, height: Axes) -> None:
 
 
 def track(width_in: float, one: Localization) -> Figure:
-    """Draw true and estimated paths from above, their heights, and the size of the error over time.
+    """Draw true and estimated paths from above, their heights, and the position error over time.
 
-    The filters are that of raw ranges and that of calibrated ranges with their variance.
+    The estimates are those with raw ranges, and with calibrated ranges and their variance.
     """
     last, narrow = one.tracks["variance"], width_in < NARROW_IN
     every = slice(None, None, max(1, len(last.time_ns) // SAMPLES))
@@ -94,7 +94,7 @@ def track(width_in: float, one: Localization) -> Figure:
     _draw_path(above, height, time, last.truth_m[every], color=INK, lw=0.9)
     error.plot([], [], color=INK, lw=0.9, label="true")
     error.plot(time, 3 * last.std_m[every], color=MUTED, lw=0.8, ls="--", label="3 σ, by the filter itself")
-    # The axis leaves out the few errors at the start and those of a diverged filter.
+    # Leave out the large errors at the start and those of a diverged filter.
     error.set_ylim(0, 1.15 * max(3 * np.quantile(last.std_m, 0.9), min(max(usual), 3 * np.median(usual))))
     _label_paths(above, height)
     label(error, "time (s)", "position error (m)")
@@ -116,9 +116,9 @@ def onboard(width_in: float, one: OnboardTrack) -> Figure:
 
 
 def arrangement(width_in: float, plan: Plan, number: int) -> Figure:
-    """Draw the boards of an arrangement, with tapes and the intervals after it.
+    """Draw the boards of an arrangement with the distances to measure, and the intervals of the delays after it.
 
-    Boards are seen from above, and in space from the side as well.
+    Boards are drawn from above; those of a plan in space also from the side.
     """
     on_line, one = plan.on == "line", plan.arrangements[number]
     figure, panels = sheet(width_in, 3 if plan.on == "" else 2, height_in=1.5 if on_line else 2.7)
@@ -133,13 +133,13 @@ def arrangement(width_in: float, plan: Plan, number: int) -> Figure:
 
 
 def _boards(axes: Axes, one: PlannedArrangement, height: int, *, on_line: bool) -> None:
-    """Draw boards by x and by their coordinate `height` (y from above, z from the side), and tapes between them."""
+    """Draw boards by their coordinates x and `height` (1: y, from above; 2: z, from the side), and tapes."""
     spots = {tag: (place[0], place[height]) for tag, place in one.place_m.items()}
     for tag, spot in spots.items():
         axes.plot(*spot, "o", ms=12, color="white", mec=BLUE, mew=1.2, zorder=3)
         axes.annotate(str(tag), spot, ha="center", va="center", color=INK, zorder=4)
     for i, j in one.taped:
-        # From left to right, so that all tapes bow upwards.
+        # Ends in order of x, so that all arcs bend upwards.
         first, second = sorted((spots[i], spots[j]))
         bow = f"arc3,rad={-0.25 if on_line else 0}"
         style: dict[str, Any] = {"arrowstyle": "<->", "color": VERMILION, "ls": "--", "shrinkA": 7, "shrinkB": 7}
@@ -160,7 +160,7 @@ def _intervals(
     before: Mapping[int, float],
     names: tuple[str, str] = ("after this arrangement", "before it"),
 ) -> None:
-    """Draw half intervals by tag as bars, and others as outlines; undetermined ones are marked as open."""
+    """Draw half intervals by tag as bars, and those `before` as outlines; undetermined delays are marked "open"."""
     rows = np.arange(len(after))
     bars: Any = ((before, names[1], 0.8, "none", MUTED), (after, names[0], 0.5, BLUE, BLUE))
     for values, text, width, face, edge in bars:
@@ -177,8 +177,8 @@ def _intervals(
     axes.grid(visible=False, axis="x")
 
 
-def more(width_in: float, next_best: tuple[NextBest, ...]) -> Figure:
-    """Draw the mean interval of the plan, and with each further measurement."""
+def next_measurements(width_in: float, next_best: tuple[NextBest, ...]) -> Figure:
+    """Draw the mean interval of the delays as planned, and with each further measurement."""
     letters = 26 if width_in < NARROW_IN else 60
     texts = ["as planned", *(textwrap.fill("+ " + best.what, letters) for best in next_best)]
     values = [next_best[0].instead_of_ns, *(best.mean_ns for best in next_best)]
@@ -194,7 +194,7 @@ def more(width_in: float, next_best: tuple[NextBest, ...]) -> Figure:
 
 
 def planned_delays(width_in: float, plan: FlightPlan) -> Figure:
-    """Draw the interval of each delay, and the prior interval of undetermined ones."""
+    """Draw the interval of each delay; for undetermined delays, outlines of the intervals in `FlightPlan.open_ns`."""
     figure, (axes,) = sheet(width_in, height_in=2.2)
     undetermined_delays = {tag: plan.open_ns[tag] for tag, half in plan.half_ns.items() if not math.isfinite(half)}
     _intervals(axes, plan.half_ns, undetermined_delays, ("determined", "stays open"))
@@ -203,7 +203,7 @@ def planned_delays(width_in: float, plan: FlightPlan) -> Figure:
 
 
 def flight(width_in: float, plan: FlightPlan) -> Figure:
-    """Draw the paths of bodies from above and in height over time; thick while their positions are known."""
+    """Draw the paths of bodies from above and their heights over time; lines are thick while positions are known."""
     figure, (above, height) = sheet(width_in, 2, height_in=2.9)
     time = np.linspace(0, plan.seconds, len(plan.path_m))
     early = time <= (plan.seconds if plan.settings.poses_until_s is None else plan.settings.poses_until_s)

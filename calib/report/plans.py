@@ -9,7 +9,7 @@ from pathlib import Path
 
 from calib.planning.result import FlightPlan, Plan
 from calib.report.campaign import write_checked
-from calib.report.figures import arrangement, flight, more, planned_delays
+from calib.report.figures import arrangement, flight, next_measurements, planned_delays
 from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text
 
 
@@ -23,7 +23,7 @@ def write_plan(
 ) -> None:
     """Write a plan as a page (.html or .pdf), and its figures into a folder, as PDF and SVG at two widths.
 
-    `commands` are shown as what carries it out. Raises what `check_places` raises.
+    `commands` are the command lines that carry out the plan. Raises the errors of `check_places`.
     """
     blocks = list(_of_flight(plan) if isinstance(plan, FlightPlan) else _of_boards(plan))
     if commands:
@@ -51,7 +51,8 @@ def _of_boards(plan: Plan) -> Iterator[Block]:
             partial(arrangement, plan=plan, number=k),
             f"Arrangement {one.name}, and the intervals of the delays when it has been made.",
         )
-    yield from _promise(plan)
+    yield Heading("Expected accuracy")
+    yield from _accuracy(plan)
 
 
 def _of_flight(plan: FlightPlan) -> Iterator[Block]:
@@ -69,12 +70,10 @@ def _of_flight(plan: FlightPlan) -> Iterator[Block]:
     )
     yield Heading("Expected accuracy")
     yield Picture("delays", partial(planned_delays, plan=plan), "Half the interval (95 %) of each delay.")
-    yield from _promise(plan)
+    yield from _accuracy(plan)
 
 
-def _promise(plan: Plan | FlightPlan) -> Iterator[Block]:
-    if isinstance(plan, Plan):
-        yield Heading("What it promises")
+def _accuracy(plan: Plan | FlightPlan) -> Iterator[Block]:
     halves = plan.half_ns.items()
     rows = [[str(tag), f"± {half:.3f} ns" if math.isfinite(half) else "undetermined"] for tag, half in halves]
     yield Table(["tag", "delay"], rows)
@@ -84,13 +83,13 @@ def _promise(plan: Plan | FlightPlan) -> Iterator[Block]:
         yield Heading("Gain of one more measurement")
         yield Picture(
             "more",
-            partial(more, next_best=plan.next_best),
+            partial(next_measurements, next_best=plan.next_best),
             "The mean interval with each further measurement; an undetermined delay counts as known to 1.5 ns.",
         )
 
 
 def _known(plan: Plan | FlightPlan) -> str:
-    """Return the beginning of a sentence on the mean precision of delays."""
+    """Return the first clause of a sentence: the mean interval of the delays (root mean square)."""
     known = [half for half in plan.half_ns.values() if math.isfinite(half)]
     if not known:
         return "No delay will be determined"

@@ -1,4 +1,4 @@
-"""The content of a report, and its origin."""
+"""The results that a report shows, and the origin of the report."""
 
 from __future__ import annotations
 
@@ -31,36 +31,37 @@ class Origin:
     files: dict[str, str] = field(default_factory=dict)
 
     def sentence(self) -> str:
-        """Return the origin in a line, for the head of a report."""
+        """Return time, version and command in one line, for the head of a report."""
         parts = [f"Made {self.made}" if self.made else "", f"by uwbcal {self.version}" if self.version else ""]
         return " ".join(filter(None, parts)) + (f": {self.command}" if self.command else "")
 
 
 def origin_of(data: Iterable[Data], command: str = "") -> Origin:
-    """Return the origin of a report on some recordings; those in memory have no files.
+    """Return the origin of a report, with hashes of the paths in `data`; other sources are ignored.
 
-    The date is now, or what `SOURCE_DATE_EPOCH` says (seconds since 1970), for files that are the same each time.
+    The time is that of the environment variable `SOURCE_DATE_EPOCH` (seconds since 1970), for reproducible files, or
+    else the present time.
     """
     from uwblink import __version__
 
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     seconds = int(epoch) if epoch.isdecimal() else datetime.datetime.now(datetime.UTC).timestamp()
-    made = datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
+    time = datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
     files = {}
     for path in (Path(one) for one in data if isinstance(one, str | os.PathLike)):
         with path.open("rb") as file:
             files[str(path)] = hashlib.file_digest(file, "sha256").hexdigest()
-    return Origin(made, command, __version__, files)
+    return Origin(time, command, __version__, files)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """The input of a report: a calibration, its fit, its recordings and its evaluation, as far as they are known.
+    """The input of a report: a calibration, and its fit, recordings and evaluation, as far as they are known.
 
-    `training` are the fitted ranges, `tests` those for the evaluation; `evaluated` is an existing evaluation of them.
-    If the tests were held out from the fitted recordings, `part` is the calibration fitted without them, which is the
-    one that is evaluated. `heard` are delays from passive listeners; `findings` those of the doctor, by recording;
-    `tracks` the localized bodies; `origin` the time of the report and its input files.
+    `training` are the fitted ranges, `tests` those for the evaluation; `evaluated` is an existing evaluation. If the
+    tests are held-out parts of the fitted recordings, `part` is the calibration that was fitted without them, and it is
+    evaluated in place of `calibration`. `heard` are delays from passive listeners; `findings` those of the doctor, by
+    recording; `tracks` the localized bodies; `origin` the time of the report and its input files.
     """
 
     calibration: Calibration
@@ -81,27 +82,27 @@ class Results:
 
     @property
     def recordings(self) -> list[Ranges]:
-        """The recordings that judge the calibration: the tests, or the training without tests."""
+        """The recordings of the evaluation: the tests, or the training if there are none."""
         return self.tests or self.training
 
     @property
     def held_out(self) -> bool:
-        """Whether it is judged on recordings that the fit has not seen."""
+        """Whether the evaluation is on recordings that were not fitted."""
         return bool(self.tests) and self.part is None and not self.evaluation.seen
 
     @property
     def judged_calibration(self) -> Calibration:
-        """The calibration whose errors are shown."""
+        """The calibration whose errors are shown: `part`, or the calibration itself."""
         return self.part or self.calibration
 
     @cached_property
     def trained(self) -> Ranges:
-        """The ranges that curves are drawn over: those of the training, or of the tests if it is unknown."""
+        """The ranges in figures of the curves: those of the training, or of the tests if the training is unknown."""
         return concatenate(self.training or self.tests)
 
     @cached_property
     def judged(self) -> Ranges:
-        """The ranges of the tests, or of the training where there are none."""
+        """The ranges of `recordings`, joined."""
         return concatenate(self.recordings)
 
     @cached_property
@@ -118,7 +119,7 @@ class Results:
 
     @cached_property
     def planted(self) -> PlantedComparison | None:
-        """The comparison of the calibration with what a simulation planted."""
+        """The comparison of the calibration with the planted values of a simulation, None without any."""
         if self.part is None:
             return self.evaluation.planted
         return compare_with_planted(self.trained, self.calibration.apply(self.trained), self.calibration)

@@ -1,6 +1,6 @@
-"""The sections of a report: a table of functions from results to blocks.
+"""The sections of a report: a table of functions that return blocks, given `Results`.
 
-A section returns its blocks, heading included, or nothing. A new section is one function and one row of `SECTIONS`.
+A section returns its blocks with its heading, or an empty list. A new section is a function and a row of `SECTIONS`.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ from calib.surveys.result import SurveyedArrangement
 from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text
 
 Section = Callable[[Results], list[Block]]
-"""Returns the blocks of a section, heading included; nothing if it does not apply."""
+"""A function that returns the blocks of a section with its heading; an empty list if it does not apply."""
 
 
 def of_recordings(section: Section) -> Section:
-    """Return a section that has no blocks where no recording judges the calibration."""
+    """Return a section that is empty for results without recordings."""
     return lambda results: section(results) if results.recordings else []
 
 
 def _verdict(results: Results) -> list[Block]:
-    unjudged = (
+    without_truth = (
         "These results were not compared with true distances. If a recording has true distances, evaluate the "
         "calibration on it: the report of that evaluation contains this section as well."
     )
-    return [*verdict(results), Text(_summary(results) if results.recordings else unjudged, "lead")]
+    return [*verdict(results), Text(_summary(results) if results.recordings else without_truth, "lead")]
 
 
 def _summary(results: Results) -> str:
-    """Return the summary, in a few sentences."""
+    """Return a summary of the errors, in a few sentences."""
     group, where = results.evaluation.overall, ""
     if results.fit is not None:
         where = " of the tests" if results.tests else " of the recordings it was fitted from"
@@ -70,7 +70,7 @@ def _summary(results: Results) -> str:
 
 
 def _warnings(results: Results) -> list[Block]:
-    told = [
+    warnings = [
         *results.warnings,
         "no tests were given: the figures below are of the fitted recordings"
         if results.fit is not None and not results.tests
@@ -84,11 +84,11 @@ def _warnings(results: Results) -> list[Block]:
             for name, one in results.findings
         ),
     ]
-    return [Text(f"Warning: {sentence}", "warning") for sentence in told if sentence]
+    return [Text(f"Warning: {sentence}", "warning") for sentence in warnings if sentence]
 
 
 def _recordings(results: Results) -> list[Block]:
-    """Return one row a recording, with the beginning of the SHA-256 of its file."""
+    """Return a table with a row per recording, with the first 12 digits of the SHA-256 of its file."""
     digests = {Path(path).name: digest[:12] for path, digest in results.origin.files.items()}
     tested = "test" if results.part is None else "held out"
     uses = [("fit", r) for r in results.training] + [(tested, r) for r in results.tests]
@@ -111,33 +111,33 @@ def _recordings(results: Results) -> list[Block]:
 
 
 def _foundations(results: Results) -> list[Block]:
-    """Return what replaces known distances; nothing where distances were known."""
-    made = results.calibration.provenance
-    if made.get("recipe") == "survey":
-        return [Heading("Known facts"), *_of_survey(made)]
-    told = known_facts(made)
-    if not told:
+    """Return the facts that a fit used instead of known distances; an empty list if distances were known."""
+    provenance = results.calibration.provenance
+    if provenance.get("recipe") == "survey":
+        return [Heading("Known facts"), *_of_survey(provenance)]
+    summary = known_facts(provenance)
+    if not summary:
         return []
-    rests, off = made["rests_on"], made.get("distance_std_m")
+    facts, off = provenance["rests_on"], provenance.get("distance_std_m")
 
     def names(key: str) -> str:
-        return ", ".join(map(str, rests.get(key) or [])) or "none"
+        return ", ".join(map(str, facts.get(key) or [])) or "none"
 
     rows = [
         ["moving bodies", names("moving")],
-        ["positions known for", f"{float(rests.get('known_s', 0.0)):.1f} s"],
-        ["anchors at given places", names("anchors_given")],
+        ["positions known for", f"{float(facts.get('known_s', 0.0)):.1f} s"],
+        ["anchors at given positions", names("anchors_given")],
         ["anchors at estimated positions", names("anchors_sought")],
-        ["attitudes from", str(rests.get("attitudes", "nowhere"))],
-        ["distances by tape", str(rests.get("distances", 0))],
+        ["attitudes from", str(facts.get("attitudes", "nowhere"))],
+        ["measured distances", str(facts.get("distances", 0))],
         ["heights of", names("heights")],
         ["standard error of estimated distances", f"{100 * off:.1f} cm" if isinstance(off, int | float) else ""],
-        ["left open", str(made.get("left_open", ""))],
+        ["undetermined", str(provenance.get("left_open", ""))],
     ]
     return [
-        Heading("What it rests on"),
-        Text(f"No true distance was known: {told}. Trajectories were estimated together with the delays."),
-        Table(["what", "of this calibration"], [row for row in rows if row[1]], words=True),
+        Heading("Known facts"),
+        Text(f"No true distance was known: {summary}. Trajectories were estimated together with the delays."),
+        Table(["fact", "value"], [row for row in rows if row[1]], words=True),
     ]
 
 
@@ -186,13 +186,13 @@ def _of_survey(made: Any) -> list[Block]:
 
 
 def _within(one: SurveyedArrangement) -> str:
-    """Return in words how well the places of an arrangement's boards are known, that of the worst."""
+    """Return the half interval of the least known position of an arrangement's boards, in words."""
     far = [board.within_m for board in one.boards if board.determined]
     return f"± {100 * max(far):.1f} cm" if far else "undetermined"
 
 
 def _determined(results: Results) -> list[Block]:
-    """Return whether the pairs determine the delays, and the assumptions of the fit."""
+    """Return whether the pairs determine all delays, and the settings of the fit."""
     if results.fit is None:
         return []
     calibration, pairs = results.calibration, pair_rows(results.trained)
@@ -218,7 +218,7 @@ def _determined(results: Results) -> list[Block]:
 
 
 def _delays(results: Results) -> list[Block]:
-    """Return delays with intervals, with planted and overheard delays if there are any."""
+    """Return delays with intervals, and planted and overheard delays if there are any."""
     calibration, heard = results.calibration, results.heard
     of_pairs: list[Block] = []
     if calibration.pair_constants:
@@ -247,7 +247,7 @@ def _delays(results: Results) -> list[Block]:
     columns = {name: cells for name, cells in columns.items() if any(cells)}
     table = Table(list(columns), list(map(list, zip(*columns.values(), strict=True))))
     caption = "Antenna delays with their 95 % intervals" + (", and planted delays in the same gauge." if known else ".")
-    draw = partial(figures.alone, partial(figures.delays, calibration, known, shift))
+    draw = partial(figures.single_figure, partial(figures.delays, calibration, known, shift))
     blocks = [Heading("Antenna delays"), *of_pairs, table, Picture("delays", draw, caption)]
     if planted:
         differs = (
@@ -266,18 +266,18 @@ def _delays(results: Results) -> list[Block]:
 
 
 def _provenance(results: Results) -> list[Block]:
-    """Return the origin of a report and its calibration."""
-    origin, made = results.origin, results.calibration.provenance
+    """Return the origin of the report and of its calibration."""
+    origin, provenance = results.origin, results.calibration.provenance
     known = {
         "report": origin.made,
         "version": origin.version,
         "command": origin.command,
-        "distances": known_facts(made),
+        "distances": known_facts(provenance),
     }
     known |= {path: f"SHA-256 {digest}" for path, digest in origin.files.items()}
     rows = [[name, text] for name, text in known.items() if text]
-    # Sections show the rest as tables and figures.
-    rest = {key: value for key, value in made.items() if key not in ("surveyed", "reflected")}
+    # Other sections show surveyed boards and reflected pairs as tables and figures.
+    rest = {key: value for key, value in provenance.items() if key not in ("surveyed", "reflected")}
     return [Heading("Provenance"), Table(["of", "what"], rows, words=True), Listing(json.dumps(rest, indent=1))]
 
 
@@ -300,12 +300,12 @@ SECTIONS: Final[dict[str, Section]] = {
 
 
 def register_report_section(name: str, section: Section, *, before: str = "provenance") -> None:
-    """Add a section to the reports of campaigns and of evaluations, above the one called `before`.
+    """Add a section to the reports of campaigns and of evaluations, above the section called `before`.
 
-    `section` takes the `Results` (a `Campaign` is one; of an evaluation, with as much as is known) and returns blocks
-    (`calib.report`: `Heading`, `Text`, `Table`, `Picture`, `Listing`), which appear in the HTML page and in the PDF;
-    figures are drawn at the width they are asked for. Raises `BadInputError` for a name that is taken and for a
-    `before` that is not there.
+    `section` is a function that takes the `Results` (or a `Campaign`, which is a subclass) and returns a list of
+    blocks (`calib.report`: `Heading`, `Text`, `Table`, `Picture`, `Listing`) for the HTML page and the PDF. It is not
+    called for results without recordings. Raises `BadInputError` if the name exists, if `before` does not, and if
+    `section` is not a function.
 
     >>> import calib
     >>> from calib.report import Heading, Text
@@ -313,7 +313,7 @@ def register_report_section(name: str, section: Section, *, before: str = "prove
     ...     return [Heading("Weather"), Text(f"Dry, for all {len(campaign.judged)} ranges.")]
     >>> calib.register_report_section("weather", weather, before="outliers")
 
-    And out again:
+    Remove it again:
 
     >>> from calib.report.sections import SECTIONS
     >>> del SECTIONS["weather"]

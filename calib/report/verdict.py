@@ -1,4 +1,7 @@
-"""The verdict on a calibration: criteria with thresholds and results, and a summary."""
+"""The verdict on a calibration: criteria with thresholds and results, and a summary.
+
+Thresholds without a comment are judgements.
+"""
 
 from __future__ import annotations
 
@@ -22,23 +25,23 @@ from uwblink.pages.blocks import Block, Table, Text
 GOOD, DOUBT, BAD = "good", "doubt", "bad"
 
 MOST_NS: Final = 0.1
-"""Half of an interval of a delay, 3 cm of range: as much as DW1000s of one kind differ by chance."""
+"""Largest half interval of a delay, 3 cm of range: delays of DW1000 boards of one kind differ by as much."""
 
 
 class Criterion(NamedTuple):
-    """A question, the requirement, the result, its grade (good, doubt, bad), and a short text."""
+    """A question, the requirement, the result, its grade (good, doubt, bad), and a clause for the summary."""
 
     question: str
-    asked: str
+    required: str
     found: str
     grade: str
-    told: str
+    summary: str
 
 
 def verdict(results: Results) -> list[Block]:
-    """Return a sentence on all criteria, and their table."""
+    """Return a summary of all criteria, and their table."""
     found = list(criteria(results))
-    bad, doubt, good = ("; ".join(one.told for one in found if one.grade == grade) for grade in (BAD, DOUBT, GOOD))
+    bad, doubt, good = ("; ".join(one.summary for one in found if one.grade == grade) for grade in (BAD, DOUBT, GOOD))
     also = f" Also: {doubt}." if doubt else ""
     sentences = (
         (bad, BAD, f"Not fit for use. {capitalized(bad)}.{also}"),
@@ -47,12 +50,12 @@ def verdict(results: Results) -> list[Block]:
     )
     kind, text = next((kind, text) for applies, kind, text in sentences if applies)
     marks = {GOOD: "✓ yes", DOUBT: "! in part", BAD: "✗ no"}
-    rows = [[one.question, marks[one.grade], one.found, one.asked] for one in found]
-    return [Text(text, kind), Table(["criterion", "met", "found", "asked for"], rows, words=True)]
+    rows = [[one.question, marks[one.grade], one.found, one.required] for one in found]
+    return [Text(text, kind), Table(["criterion", "met", "found", "required"], rows, words=True)]
 
 
 def capitalized(text: str) -> str:
-    """Return a text as a sentence begins."""
+    """Return a text with its first letter in upper case."""
     return text[:1].upper() + text[1:]
 
 
@@ -83,7 +86,7 @@ def _graded(good: bool, tolerable: bool) -> str:
 
 
 def _of_uses(results: Results) -> Iterator[Criterion]:
-    """Yield whether the curves hold for the recordings' powers, and whether positions become better."""
+    """Yield the criteria on powers outside the fitted ones, and on position errors."""
     most, share = 0.05, results.evaluation.overall.clamped
     yield Criterion(
         "Are the powers of the recordings within the fitted powers?",
@@ -105,25 +108,26 @@ def _of_uses(results: Results) -> Iterator[Criterion]:
 
 def _held_out(results: Results) -> Criterion:
     judged = results.judged
-    found, told = f"{judged.source}: {len(judged)} ranges", "it was evaluated on other recordings than the fitted ones"
+    found = f"{judged.source}: {len(judged)} ranges"
+    summary = "it was evaluated on other recordings than the fitted ones"
     if results.part is not None:
         share = len(judged) / (len(judged) + int(results.part.provenance["exchanges"]))
         found = f"in part: a second fit was evaluated on {100 * share:.0f} % of the same recordings, held out from it"
-        told = "it was evaluated on held-out parts of the fitted recordings, not on another recording"
+        summary = "it was evaluated on held-out parts of the fitted recordings, not on another recording"
     elif not results.held_out:
         found = "no: on the fitted recordings"
-        told = "it was evaluated only on the fitted recordings, so the following results are too optimistic"
+        summary = "it was evaluated only on the fitted recordings, so the following results are too optimistic"
     return Criterion(
         "Was it evaluated on other recordings than the fitted ones?",
         "yes",
         found,
         _graded(results.held_out, True),
-        told,
+        summary,
     )
 
 
 def _gain(results: Results) -> Criterion:
-    least = 0.05  # of the typical error: a calibration that removes less is not worth its use
+    least = 0.05  # share of the median absolute error that a useful calibration removes at least
     truth, corrected = results.judged.truth_m, results.corrected
     raw, full = (float(np.median(np.abs(range_m - truth))) for range_m in (corrected.raw_m, corrected.corrected_m))
     less = 1 - full / raw if raw > 0 else 0.0
@@ -137,9 +141,9 @@ def _gain(results: Results) -> Criterion:
 
 
 def _bias(results: Results) -> Criterion:
-    most = 0.5  # of the spread of one range: so large a bias adds an eighth to the error of a single range
+    most = 0.5  # of the spread of one range: a bias of this size increases the rms error by an eighth, sqrt(1 + 0.5^2)
     pairs = {name: group.full for name, group in results.evaluation.pairs.items()}
-    # The bias beyond chance: few ranges of a pair determine little.
+    # The significant part of the bias: the median error of few ranges is uncertain.
     ratios = {
         name: max(abs(full.median_m) - _median_bound_m(full, len(pairs)), 0.0) / max(full.robust_std_m, 1e-9)
         for name, full in pairs.items()
@@ -159,9 +163,9 @@ def _bias(results: Results) -> Criterion:
 
 
 def _median_bound_m(stats: Stats, pairs: int) -> float:
-    """Return the bound of a median error by chance, at 1 % for all pairs together (Bonferroni), in metres.
+    """Return the bound of the median error of an unbiased pair in metres, by Student's t.
 
-    Sigma is known to n - 1 degrees of freedom.
+    The medians of all pairs are within their bounds except with a probability of 1 % (Bonferroni).
     """
     if stats.n < 2:
         return math.inf
@@ -173,8 +177,8 @@ def _interval(results: Results) -> Criterion:
     known = bool(np.isfinite(overall.inside_95))
     share = overall.inside_95 if known else overall.coverage["95"]
     of_what = "reflections included" if known else "by sigma only; the calibration has no error model"
-    low, high = 0.90, 0.985  # with less, a filter trusts the ranges too much; with more, too little
-    # 99 % interval of the share (Wilson's), as of independent ranges.
+    low, high = 0.90, 0.985  # below, a filter gives ranges too much weight; above, too little
+    # 99 % interval of the share for independent ranges (Wilson 1927).
     count = overall.full.n
     least, most = map(float, binomtest(round(share * count), count).proportion_ci(0.99, "wilson"))
     return Criterion(
@@ -188,27 +192,27 @@ def _interval(results: Results) -> Criterion:
 
 def _settled(results: Results) -> Criterion:
     known = results.calibration
-    asked = ("Are the antenna delays known well enough?", f"95 % interval of each within ± {MOST_NS:g} ns (3 cm)")
+    head = ("Are the antenna delays known well enough?", f"95 % interval of each within ± {MOST_NS:g} ns (3 cm)")
     if known.provenance.get("undetermined"):
-        return Criterion(*asked, undetermined_delays(results), BAD, undetermined_delays(results))
+        return Criterion(*head, undetermined_delays(results), BAD, undetermined_delays(results))
     half = {f"tag {t}": TWO_SIDED_95 * std for t, std in known.delays_std_ns.items() if np.isfinite(std)}
     if known.undetermined_splits:
         of_pairs = {pair_name(pair): one.std_m for pair, one in known.pair_constants.items()}
         half |= {f"pair {name}": TWO_SIDED_95 * std / METRES_A_NS for name, std in of_pairs.items() if np.isfinite(std)}
     if not half:
-        return Criterion(*asked, "the calibration states no intervals", DOUBT, "delays have no intervals")
+        return Criterion(*head, "the calibration states no intervals", DOUBT, "delays have no intervals")
     widest = max(half, key=lambda name: half[name])
-    told = (
+    summary = (
         f"the delay of {widest} is only known to ± {half[widest]:.2f} ns"
         if half[widest] > MOST_NS
         else f"delays are known to ± {half[widest]:.3f} ns or better"
     )
     grade = _graded(half[widest] <= MOST_NS, half[widest] <= 3 * MOST_NS)
-    return Criterion(*asked, f"widest: {widest}, ± {half[widest]:.3f} ns", grade, told)
+    return Criterion(*head, f"widest: {widest}, ± {half[widest]:.3f} ns", grade, summary)
 
 
 def undetermined_delays(results: Results) -> str:
-    """Return in words the delays that the pairs do not determine, "" for none."""
+    """Return a text on the delays that the pairs do not determine, "" without any."""
     made, splits = results.calibration.provenance, results.calibration.undetermined_splits
     if splits and "left_open" not in made:
         return split_text(splits)
@@ -228,7 +232,7 @@ def _warned(results: Results) -> Criterion:
 
 
 def _of_survey(results: Results) -> Iterator[Criterion]:
-    """Yield what a survey of standing boards says of itself."""
+    """Yield the criteria for surveys of boards that stand still."""
     made = results.calibration.provenance
     rests, pairs = made["rests_on"], int(made["pairs"])
     against = contradictions_in(made)
@@ -241,7 +245,7 @@ def _of_survey(results: Results) -> Iterator[Criterion]:
         if against
         else "nothing contradicts",
     )
-    # With few, a wrong range is not seen, and the spread of errors is a guess.
+    # With few degrees of freedom, wrong ranges are not detected, and the spread of errors is hardly determined.
     freedom, least = float(rests["freedom"]), 10.0
     yield Criterion(
         "Do the arrangements check each other?",
@@ -258,7 +262,7 @@ def _of_survey(results: Results) -> Iterator[Criterion]:
         _graded(error <= most_m, error <= 2 * most_m),
         f"a pair has a constant error of {100 * error:.1f} cm in an arrangement",
     )
-    # Where more pairs are reflected, some of it hides in the places of boards.
+    # If more pairs are reflected, positions of boards absorb a part of the detours.
     count, most = sum(float(row["chance"]) for row in made.get("reflected", [])), 0.05
     share = count / max(pairs, 1)
     yield Criterion(
@@ -268,7 +272,7 @@ def _of_survey(results: Results) -> Iterator[Criterion]:
         _graded(share <= most, share <= 0.2),
         f"{100 * share:.0f} % of the pairs are probably reflected",
     )
-    # Three standard deviations of a single unknown.
+    # -2 log likelihood is 9 at three standard deviations of one unknown.
     second, clear = made.get("second_best"), 9.0
     worse = math.inf if second is None else float(second)
     yield Criterion(
@@ -293,7 +297,7 @@ def _of_survey(results: Results) -> Iterator[Criterion]:
 
 
 def _distances(std_m: float) -> Criterion:
-    """Return how well distances are known that were found together with the delays."""
+    """Return the criterion for distances that were estimated together with the delays."""
     most_m = 0.02
     return Criterion(
         "Are the estimated distances known well enough?",

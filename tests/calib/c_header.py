@@ -1,4 +1,4 @@
-"""Calibrations in C: the header that is exported, compiled strictly with a program of the test."""
+"""Calibrations in C: a program includes the exported header and is compiled with strict warnings."""
 
 import shutil
 import subprocess
@@ -11,7 +11,7 @@ STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 
 
 def printed(folder, known, main, text=""):
-    """Return what a program prints that includes the header of a calibration; skips where there is no compiler."""
+    """Return the output of a program that includes the header of a calibration; skips without a compiler."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         pytest.skip("no C compiler on this machine")

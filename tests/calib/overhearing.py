@@ -9,10 +9,11 @@ REPLY_S, THIRD_S = 0.4e-3, 1.5e-3
 
 
 def flight(seed, *, tags=6, count=1500, noise_ns=0.15, pairs=None, listeners=None, reflected=0.0, bias_m=0.0):
-    """Return a recording and the planted delays in ns (tags,), all of them in receptions: stamps come earlier by them.
+    """Return a recording and the planted delays in ns (tags,), which are delays of reception: stamps are earlier by
+    them.
 
-    Every reception has normal noise, a share is `reflected` by 0.03 m and an exponential detour of 0.3 m, and with the
-    power the bias goes from plus to minus `bias_m`.
+    Every reception has normal noise; a share is `reflected` by 0.03 m plus an exponential detour of 0.3 m; the bias
+    changes from plus to minus `bias_m` with power.
     """
     g = np.random.default_rng(seed)
     place, delay_ns = g.uniform(0, 8, (tags, 3)), g.normal(0, 0.3, tags)
@@ -59,9 +60,10 @@ def flight(seed, *, tags=6, count=1500, noise_ns=0.15, pairs=None, listeners=Non
 
 
 def _rows(i, j, tags, *, listening=True):
-    """Return errors of receptions (rows, 3 + 3 k) and delays (rows, tags) in a range and what k others overhear of it.
+    """Return errors of receptions (rows, 3 + 3 k) and delays (rows, tags) in a range and in what k others overhear of
+    it.
 
-    Stamps' errors pass the formulas to first order, with the rate of the target's clock from its two transmissions.
+    Errors of stamps are propagated to first order, with the rate of the target's clock from its two transmissions.
     """
     share, others = REPLY_S / THIRD_S, [k for k in range(tags) if k not in (i, j)] if listening else []
     errors, slopes = np.zeros((1 + len(others), 3 + 3 * len(others))), np.zeros((1 + len(others), tags))
@@ -75,7 +77,7 @@ def _rows(i, j, tags, *, listening=True):
 
 
 def bound_ns2(pairs, tags, *, count=1500, noise_ns=0.15, listening=True):
-    """Return the Cramer-Rao bound (tags, tags) of delays in ns^2: of ranges, and of what all others overhear."""
+    """Return the Cramer-Rao bound (tags, tags) of delays in ns^2, from ranges and from what all others overhear."""
     known = np.zeros((tags, tags))
     for i, j in (pairs[k % len(pairs)] for k in range(count)):
         errors, slopes = _rows(i, j, tags, listening=listening)
@@ -84,7 +86,7 @@ def bound_ns2(pairs, tags, *, count=1500, noise_ns=0.15, listening=True):
 
 
 def least_squares_ns(data, tags=6):
-    """Return the delays (tags,) in ns that generalised least squares finds in the stamps of a whole flight."""
+    """Return the delays (tags,) in ns by generalised least squares from the stamps of a whole flight."""
     e, h = data.exchanges, data.overheard
     place = {body: data.poses.position_m[data.poses.body == body][0] for body in {tag.body for tag in data.tags}}
     at = np.array([place[f"mast {k}"] for k in range(tags)])

@@ -1,11 +1,11 @@
-"""Tables of ranges as a stranger's program writes them, with planted constants; shares no code with the project."""
+"""Tables of ranges as written by another program, with planted constants; shares no code with the project."""
 
 import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-LIGHT = 0.299702547  # metres a nanosecond, in air
+LIGHT = 0.299702547  # metres per nanosecond, in air
 DELAYS_NS = {1: -0.35, 2: 0.12, 3: -0.05, 11: 0.2, 12: -0.15, 13: 0.05}
 ANCHORS = {11: (0.0, 0.0, 2.4), 12: (6.0, 0.3, 2.2), 13: (2.8, 5.5, 0.4)}
 COLUMNS = "time_s,from_id,to_id,range_m,fpp1,fpp2,from_x_m,from_y_m,from_z_m,to_x_m,to_y_m,to_z_m"
@@ -13,7 +13,7 @@ COLUMNS = "time_s,from_id,to_id,range_m,fpp1,fpp2,from_x_m,from_y_m,from_z_m,to_
 
 @dataclass
 class Plan:
-    """What a table holds: ranges among robots and anchors, by their pairs."""
+    """Content of a table: ranges among robots and anchors, by their pairs."""
 
     count: int = 3000
     seed: int = 1
@@ -37,7 +37,7 @@ def place(tag, time_s):
 
 
 def bias_m(power_dbm):
-    """Long by some centimetres where power is weak."""
+    """Return a bias of some centimetres at low power."""
     return 0.05 * math.tanh((-88 - power_dbm) / 3)
 
 
@@ -59,7 +59,7 @@ def rows(plan):
 
 
 def write(path, plan, *, power=True):
-    """Write a CSV of ranges with positions and, unless told otherwise, powers."""
+    """Write a CSV of ranges with positions and, by default, powers."""
     lines = [COLUMNS]
     for time_s, a, b, measured, dbm, *places in rows(plan):
         levels = f"{dbm:.2f},{dbm:.2f}" if power else ","
@@ -69,5 +69,5 @@ def write(path, plan, *, power=True):
 
 
 def pair_constant_m(a, b):
-    """By how much ranges of a pair are too long, from their delays."""
+    """Return the excess of the ranges of a pair, from its delays."""
     return -LIGHT * (DELAYS_NS[a] + DELAYS_NS[b]) / 2

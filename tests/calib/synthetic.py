@@ -47,7 +47,7 @@ def constant_curve(value_m):
 
 
 def calibration(delays_ns: dict[int, float], sigma_m: float, **more: Any) -> Calibration:
-    """Return a calibration with the same noise at every power, no bias, and delays that are known exactly."""
+    """Return a calibration with equal noise at all powers, no bias, and delays that are known exactly."""
     known: dict[str, Any] = {"delays_std_ns": dict.fromkeys(delays_ns, 0.0), "loss": "cauchy", "scale_ns": 0.1} | more
     return Calibration(
         delays_ns=delays_ns, lift="mean-of-lifted", alpha_dbm=-82.0, speed_of_light=SPEED_OF_LIGHT,
@@ -56,13 +56,13 @@ def calibration(delays_ns: dict[int, float], sigma_m: float, **more: Any) -> Cal
 
 
 def design(some, tags):
-    """Return the derivative of calibrated ranges by delays, in metres a nanosecond, written out (n, tags)."""
+    """Return the explicit derivative of calibrated ranges by delays, in metres per nanosecond (n, tags)."""
     ends = (some.initiator, some.weight_initiator), (some.target, some.weight_target)
     return sum((ids[:, None] == np.array(tags)) * weight[:, None] for ids, weight in ends) * SPEED_OF_LIGHT * 1e-9
 
 
 def about_their_mean(known: Calibration, planted: dict[int, float]):
-    """Return errors of delays about their mean (tags,) and the standard errors of these, in ns, by planted delays."""
+    """Return errors of delays about their mean (tags,) and their standard errors, in ns, given planted delays."""
     centre = np.eye(len(planted)) - 1 / len(planted)
     error = centre @ [known.delays_ns[tag] - delay for tag, delay in planted.items()]
     return error, np.sqrt(np.diag(centre @ known.covariance_ns2(list(planted)) @ centre))

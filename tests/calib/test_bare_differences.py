@@ -1,7 +1,7 @@
 """Differences of arrival without stamps, from a table to a calibration and a track.
 
-A page of NumPy that shares no code with the packages makes the table: a tag flies among eight anchors whose delays are
-planted, and logs by how much farther it is from one anchor than from another.
+NumPy alone, without the packages, makes the table: a tag flies among eight anchors with planted delays, and logs the
+difference of its distances to two anchors.
 """
 
 import json
@@ -31,7 +31,9 @@ def place_m(time_s):
 
 
 def flown(seed, seconds, *, reflected=0.05):
-    """Times, ids from 1 and differences: to the second anchor, less to the first, with noise and some reflections."""
+    """Return times, ids from 1 and differences: distance to the second anchor minus that to the first, with noise and
+    reflections.
+    """
     random = np.random.default_rng(seed)
     time_s = np.arange(0, seconds, 1 / 160)
     first = np.arange(len(time_s)) % 8
@@ -45,7 +47,7 @@ def flown(seed, seconds, *, reflected=0.05):
 
 
 def write(folder, rows, header="time_s,tag,anchor_a,anchor_b,difference_m"):
-    """A table of differences, poses of the tag and the places of the anchors."""
+    """Write a table of differences, poses of the tag and positions of the anchors."""
     time_s, first, second, difference = rows
     lines = [f"{t:.6f},{TAG},{a},{b},{d:.12g}" for t, a, b, d in zip(time_s, first, second, difference, strict=True)]
     (folder / "d.csv").write_text("\n".join([header, *lines, ""]))
@@ -59,7 +61,7 @@ def write(folder, rows, header="time_s,tag,anchor_a,anchor_b,difference_m"):
 
 
 def imported(folder, rows, *, swapped=False, mocap=True):
-    """The path of a recording with what is flown; `swapped` by a map with the other sign."""
+    """Return the path of a recording of a flight; `swapped` by a map with the other sign."""
     folder.mkdir(exist_ok=True)
     write(folder, rows)
     processes.succeed("uwblink", "import", "guess", "d.csv", "-o", "map.toml", cwd=folder)
@@ -75,7 +77,7 @@ def imported(folder, rows, *, swapped=False, mocap=True):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two recordings, fit/d.uwb and fly/d.uwb, and a fit of the one: fit.json, and fit.out and fit.err as printed."""
+    """Two recordings, fit/d.uwb and fly/d.uwb, and a fit of the first: fit.json, and fit.out and fit.err as printed."""
     found = tmp_path_factory.mktemp("differences")
     imported(found / "fit", flown(1, 60.0))
     imported(found / "fly", flown(2, 20.0))
@@ -89,14 +91,14 @@ def test_delays_come_out_but_for_what_they_have_in_common(folder):
     known = calib.load_calibration(folder / "fit.json")
     found = np.array([known.delays_ns[tag] for tag in range(1, 9)])
     std = np.array([known.std_of_sum_ns([tag]) for tag in range(1, 9)])
-    # Of 9600 rows each anchor is in a quarter, by half its delay: 0.1 m/sqrt(2400)/0.15 m/ns = 0.0136 ns, which the
-    # partners' delays, the loss and 5 % of reflections make half as large again at most.
+    # Each anchor is in a quarter of 9600 rows, with half of its delay: 0.1 m/sqrt(2400)/0.15 m/ns = 0.0136 ns; the
+    # delays of partners, the loss and 5 % of reflections increase this by at most a half.
     assert np.all((std > 0.012) & (std < 0.022))
     wrong = found - (DELAYS_NS - DELAYS_NS.mean())
     assert np.all(np.abs(wrong) < 4 * std)
     assert np.sqrt(np.mean((wrong / std) ** 2)) < 1.8, "99.9 % of the roots of chi-square over seven"
     assert (set(known.delays_std_ns.values()), known.undetermined_splits) == ({np.inf}, (((), tuple(range(1, 9))),))
-    # Noise is that of a difference.
+    # The noise is that of a difference.
     assert known.sigma_curve(np.ones(1))[0] == pytest.approx(NOISE_M, rel=0.05)
 
 
@@ -164,7 +166,7 @@ def test_the_tag_is_tracked_on_board(folder, model):
 
 
 def test_a_calibration_of_ranges_corrects_differences(folder):
-    """Its noise is that of a range, of which a difference has five times the variance."""
+    """Its noise is that of a range; a difference has five times the variance."""
     random = np.random.default_rng(5)
     time_s = np.arange(0, 60.0, 1 / 80)
     anchor = np.arange(len(time_s)) % 8
@@ -177,7 +179,7 @@ def test_a_calibration_of_ranges_corrects_differences(folder):
     known = calib.fit(ranges, delays_only=True, fixed_ns={TAG: 0.1}, between_m=0.0).calibration
     total = summarize(calib.localize(folder / "fly/d.uwb", known, Settings(use="receptions", seeds=1)))
     assert total.rmse_m["variance"] < 0.045 < 0.08 < total.rmse_m["raw"]
-    # The bounds, 2.5 and 3.5, hold 95 %: 0.9 is 3.5 standard deviations. A variance of half as much would give 6.
+    # The bounds, 2.5 and 3.5, contain 95 %: 0.9 is 3.5 standard deviations. With half of the variance it would be 6.
     assert total.nees == pytest.approx(3.0, abs=0.9)
 
 

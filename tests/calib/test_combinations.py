@@ -1,4 +1,4 @@
-"""Settings of a fit in combination, over recordings of different kinds: each gives a calibration or a reason."""
+"""Combinations of settings of a fit, over recordings of different kinds: each gives a calibration or a reason."""
 
 from contextlib import suppress
 from functools import cache
@@ -54,7 +54,7 @@ def another():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_each_setting_alone_and_pairs_of_settings_are_fitted_or_refused(tmp_path, name):
-    # A third of all pairs of settings, and of these each flight has its share.
+    # A third of all pairs of settings; each flight has its share of them.
     own = list(combinations(CHANGES, 2))[list(FLIGHTS).index(name) :: 3 * len(FLIGHTS)]
     for number, changes in enumerate([*([one] for one in CHANGES), *own]):
         file = tmp_path / f"{number}.json"

@@ -1,4 +1,4 @@
-"""The front door of calib: its names, what importing it costs, and its examples."""
+"""The front door of calib: its names, the cost of importing it, and its examples."""
 
 import doctest
 from dataclasses import replace
@@ -29,7 +29,7 @@ def test_the_examples_run(name, monkeypatch):
     for one in examples:
         runner.run(one)
     assert runner.summarize(verbose=False).failed == 0
-    # An example that adds something takes it out again: other tests must not find it.
+    # An example that registers something removes it again, so that other tests do not find it.
     assert (set(LOSSES), dict(SECTIONS)) == (losses, sections)
 
 
@@ -62,7 +62,7 @@ def test_what_is_no_calibration_is_refused_by_its_parameter(tmp_path):
                 call(wrong)
             assert caught.value.parameter == ("second" if name == "compare" else "calibration")
     assert list(tmp_path.iterdir()) == []
-    # A result and the path of a calibration are as good as the calibration.
+    # A result and the path of a calibration are accepted like the calibration.
     result.save(tmp_path / "c.json")
     with pytest.raises(FileExistsError):
         result.save(tmp_path / "c.json")
@@ -74,7 +74,7 @@ def test_what_is_no_calibration_is_refused_by_its_parameter(tmp_path):
     assert result.correct(3.0, -85.0, -86.0, 1, 2) == result.calibration.correct(3.0, -85.0, -86.0, 1, 2)
 
 
-# What the figures of a calibration draw: the centre that a curve follows, and axes that one stray does not flatten.
+# Figures of a calibration: the centre that a curve follows, and axes that an outlier does not flatten.
 
 
 @pytest.fixture(scope="module")
@@ -101,12 +101,12 @@ def points_and_curve(axes):
 
 
 def test_points_are_the_core_that_the_curve_follows_and_medians_lie_above():
-    # Planted: a core of 5 cm about nothing, a fifth of it lengthened by 40 cm in the mean.
+    # Planted: a core of 5 cm about zero, a fifth of it lengthened by 40 cm on average.
     rng = np.random.default_rng(5)
     error = rng.normal(0, 0.05, 40_000) + np.where(rng.random(40_000) < 0.2, rng.exponential(0.4, 40_000), 0)
     everything = {"": (np.arange(40_000), 20)}
     found = binned(rng.uniform(0, 1.5, 40_000), error, everything, "mixture")[""]
-    # Of 2000 in a bin the centre is known to 1.5 mm, and its spread, told with the tail's, to 2 mm.
+    # 2000 ranges in a bin determine the centre to 1.5 mm, and the spread, estimated with the tail, to 2 mm.
     assert np.abs(found.centre_m).max() < 0.006
     assert np.abs(found.centre_m.mean()) < 0.001
     assert found.std_m == pytest.approx(0.05, abs=0.008)
@@ -118,7 +118,7 @@ def test_points_are_the_core_that_the_curve_follows_and_medians_lie_above():
 def test_the_drawn_curve_goes_through_the_drawn_points(fitted):
     axes = axes_of(fitted.plot_bias)
     points, at = points_and_curve(axes)
-    # 600 a bin: the centre of a core of 5 cm beside a fifth of reflections is known to 3 mm; medians lie 1.5 cm above.
+    # 600 per bin: the centre of a core of 5 cm with a fifth of reflections is known to 3 mm; medians are 1.5 cm above.
     assert np.abs(points.get_ydata() - at).max() < 1.2
     assert np.sqrt(np.mean((points.get_ydata() - at) ** 2)) < 0.5
     assert np.mean(labelled(axes, "medians, reflections included").get_ydata() - at) > 1.0
@@ -160,7 +160,7 @@ def test_a_histogram_shows_corrected_errors_whatever_raw_ones_are(fitted, offset
     axes = axes_of(lambda a: histogram(fitted.ranges, applied, a))
     assert np.ptp(axes.get_xlim()) < 400
     heights = {one.get_label(): sum(one.get_data().values) for one in axes.patches}
-    # The last bins hold what lies beyond.
+    # The outermost bins include larger errors.
     assert [heights[name] for name in ("raw", "fully corrected")] == pytest.approx([100, 100])
 
 

@@ -1,4 +1,4 @@
-"""What an information matrix determines: planted free directions, and the words for them."""
+"""Directions that an information matrix determines: planted free directions, and their description."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def from_rows(rows, weight=1e4):
 
 
 def ring(*, closed=True):
-    """Sums of delays of neighbours, and with `closed` a triangle that settles everything."""
+    """Return sums of delays of neighbours, and with `closed` a triangle that determines all."""
     return [[1, 1, 0, 0], [0, 1, 1, 0], [0, 0, 1, 1], [1, 0, 0, 1]] + ([[1, 0, 1, 0]] if closed else [])
 
 
@@ -34,7 +34,7 @@ def test_a_full_matrix_gives_the_inverse():
 SIDES = [InformationColumn("delay", t) for t in "123"] + [
     InformationColumn("distance", p) for p in ("1-2", "2-3", "1-3")
 ]
-# Ranges are distances less delays, and differences of distances are known.
+# Ranges are distances minus delays, and differences of distances are known.
 TRIANGLE = [
     [-1, -1, 0, 1, 0, 0], [0, -1, -1, 0, 1, 0], [-1, 0, -1, 0, 0, 1], [0, 0, 0, 1, -1, 0], [0, 0, 0, 0, 1, -1]
 ]  # fmt: skip
@@ -89,7 +89,7 @@ def test_what_is_no_information_matrix_is_refused(matrix, settings, message):
         judge(matrix, DELAYS[:2], **settings)
 
 
-# The one model of a range's error against SciPy, integrals and differences that share no code with it.
+# The model of the error of a range compared with SciPy, integrals and differences that share no code with it.
 
 
 SIGMA, LEAST, DETOUR = 0.08, 0.1, 0.3
@@ -97,7 +97,7 @@ SIGMA, LEAST, DETOUR = 0.08, 0.1, 0.3
 
 @pytest.mark.parametrize("share", [0.0, 0.3])
 def test_one_and_two_kinds_of_detour_are_exponentials(share):
-    # From far before the least detour to where the noise is no longer of any account.
+    # From far below the least detour to where the noise is negligible.
     e, long = np.linspace(-0.6, 12, 500), LongDetours(share=share, factor=4.0)
     found = densities(e, np.full(500, SIGMA), LEAST, DETOUR, long)
     np.testing.assert_allclose(found.direct, norm.pdf(e, scale=SIGMA), rtol=1e-12, atol=1e-300)
@@ -107,7 +107,7 @@ def test_one_and_two_kinds_of_detour_are_exponentials(share):
     np.testing.assert_allclose(found.reflected, expected, rtol=1e-9, atol=1e-300)
     assert sum(share * mean for share, mean in parts) == pytest.approx(DETOUR)
     assert long.square * DETOUR**2 == pytest.approx(sum(share * mean**2 for share, mean in parts))
-    # Mean and variance of the noise: the density's slope and curvature say them (Tweedie's formula).
+    # Mean and variance of the noise follow from slope and curvature of the density (Tweedie's formula).
     step = 1e-4
     logs = [
         np.log(densities(e[:200] + k * step, np.full(200, SIGMA), LEAST, DETOUR, long).reflected) for k in (-1, 0, 1)
@@ -137,7 +137,7 @@ def slopes(error, **changed):
 def test_the_density_is_one():
     points = [0.0, 0.05, 0.2, 1.0]
     mass, _ = quad(lambda e: float(np.exp(slopes(e).log_density[0])), -1.0, 9.0, points=points, limit=400)
-    # Outliers are spread over ten metres, from wherever they are counted.
+    # Outliers are spread over ten metres, from any origin.
     assert mass == pytest.approx(1.0, abs=2e-4)
 
 

@@ -1,6 +1,6 @@
 """The blocks of a page (headings, paragraphs, tables, figures), its HTML, and its files.
 
-A page of HTML needs no other file; its drawings follow the page's light and fonts.
+An HTML page needs no other file. Its figures use the fonts of the page, and its light or dark colours.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 VARIABLES: Final = {colour: f"--f{number}" for number, colour in enumerate(DARK)}
-"""The CSS variable of each colour of a figure; its value depends on the ground of the page."""
+"""The CSS variable of each colour in figures; its value is that of the light or of the dark page."""
 
 
 def _figure_colours(*, dark: bool) -> str:
@@ -35,16 +35,16 @@ def _part(name: str) -> str:
 
 CSS: Final = (
     _part("page.css")
-    .replace("/* figures by day */", _figure_colours(dark=False))
-    .replace("/* figures by night */", _figure_colours(dark=True))
+    .replace("/* light colours of figures */", _figure_colours(dark=False))
+    .replace("/* dark colours of figures */", _figure_colours(dark=True))
 )
-"""Styles for a screen, a phone, light and dark ground, and paper."""
+"""Styles for screens, phones, light and dark pages, and print."""
 
 
 def inline(svg: bytes, caption: str) -> str:
-    """Return a drawing as part of a page: no prologue, no fixed size, the colours and fonts of the page.
+    """Return an SVG for an HTML page: without prologue and fixed size, with the colours and fonts of the page.
 
-    What its panels show (see `uwblink.pages.figures.drawn`) is in the attribute `data-panels`.
+    The attribute `data-panels` describes its panels (see `uwblink.pages.figures.drawn`).
     """
     text = svg.decode()
     text = text[text.index("<svg") :]
@@ -62,7 +62,7 @@ def inline(svg: bytes, caption: str) -> str:
 
 
 def prose(text: str) -> str:
-    """Return text as HTML, names in backticks as code."""
+    """Return a text as HTML, with names in backticks as code."""
     return re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))
 
 
@@ -74,14 +74,15 @@ def table_html(
     total: bool = False,
     words: bool = False,
 ) -> str:
-    """Return a table of texts; `above` are headings with the columns they span, the last row is set apart if `total`.
+    """Return a table of texts as HTML.
 
-    Tables of `words` are left-aligned and break their lines. Tables of more than eight columns are set smaller.
+    `above` are headings with the number of columns that each spans. With `total`, the last row is emphasised. Tables of
+    `words` are left-aligned, and their lines may break. Tables with more than eight columns have smaller text.
     """
     spans = "".join(f"<th colspan='{span}'>{escape(name)}</th>" for name, span in above)
     over = f"<tr class='above'>{spans}</tr>" if spans else ""
     head = "".join(f"<th>{escape(name)}</th>" for name in header)
-    # On a phone cells of words stand below each other, each with its heading; of two columns the second needs none.
+    # On a phone, the cells of a row of words are below each other, with their headings; with two columns, without.
     heads = ["", *header[1:]] if words and len(header) > 2 else [""] * len(header)
     body = ""
     for k, row in enumerate(rows):
@@ -108,15 +109,15 @@ class Heading:
 class Text:
     """A paragraph.
 
-    `kind` is "plain", "lead" (the summary at the top), "warning", "note" (below a table), or the verdict: "good",
-    "doubt" or "bad", of which the first sentence is set large.
+    `kind` is "plain", "lead" (a summary at the top), "warning", "note" (below a table), or that of a verdict, "good",
+    "doubt" or "bad", whose first sentence is larger.
     """
 
     text: str
     kind: str = "plain"
 
     def parts(self) -> tuple[str, str]:
-        """Return the large and the normal part of the text."""
+        """Return the larger and the normal part of the text."""
         if self.kind not in ("good", "doubt", "bad"):
             return "", self.text
         first, dot, rest = self.text.partition(". ")
@@ -125,9 +126,10 @@ class Text:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table of texts; the first column is left-aligned. `above` are headings with the columns they span.
+    """A table of texts; the first column is left-aligned, the others right-aligned.
 
-    The last row is set apart if `total`; a table of `words` is left-aligned, and its lines may break.
+    `above` are headings with the number of columns that each spans. With `total`, the last row is emphasised. A table
+    of `words` is left-aligned, and its lines may break.
     """
 
     header: list[str]
@@ -139,10 +141,10 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure with its file name (no suffix) and caption.
+    """A figure with its file name (without suffix) and caption.
 
-    `draw` takes a width in inches (3.5 for a column or a phone, 7.16 for a page) and returns the figure at that width,
-    with text of 8 pt. It is called in a context that sets fonts and colours (`uwblink.pages.figures`).
+    `draw` is a function that takes a width in inches (3.5 for a column or a phone, 7.16 for a page) and returns the
+    figure at that width. It is called in a context that sets fonts of 8 pt and colours (`uwblink.pages.figures`).
     """
 
     name: str
@@ -152,7 +154,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """Preformatted text; lines of a `table` are not broken on a screen."""
+    """Preformatted text. On a screen, the lines of a `table` do not break."""
 
     text: str
     table: bool = False
@@ -163,9 +165,9 @@ Block = Heading | Text | Table | Picture | Listing
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """A title and its blocks, in order; `subtitle` says when and how it was made.
+    """A title and blocks, in order; `subtitle` states when and how the document was made.
 
-    Figures of the same name are numbered, so that their files differ.
+    If figures have the same name, numbers are added, so that their files differ.
     """
 
     title: str
@@ -173,7 +175,7 @@ class Document:
     subtitle: str = ""
 
     def __post_init__(self) -> None:
-        """Number figures of the same name from the second on."""
+        """Add numbers to the names of figures that repeat an earlier name."""
         seen: Counter[str] = Counter()
         for k, block in enumerate(self.blocks):
             if isinstance(block, Picture):
@@ -186,18 +188,18 @@ class Document:
         return [block for block in self.blocks if isinstance(block, Picture)]
 
     def captions(self) -> dict[str, str]:
-        """Return the captions of the figures by name, numbered."""
+        """Return the captions of the figures by name, with their numbers."""
         return {p.name: f"Figure {number}. {p.caption}" for number, p in enumerate(self.pictures(), 1)}
 
     def contents(self) -> list[str]:
-        """Return the headings; they are listed above the first section where there are more than two."""
+        """Return the headings; a page with more than two lists them above the first section."""
         return [block.text for block in self.blocks if isinstance(block, Heading)]
 
 
 def draw_figures(
     document: Document, kinds: Mapping[str, Sequence[str]], progress: Callable[[str | float], None] = lambda _: None
 ) -> dict[str, bytes]:
-    """Draw each figure of a document once at each width; returns files such as "errors-page.svg".
+    """Draw each figure of a document once at each width; return files by name, such as "errors-page.svg".
 
     `kinds` are the kinds of files by width, "page" or "column". `progress` is called with the present step, and with
     the share of the figures that are drawn.
@@ -215,9 +217,9 @@ def draw_figures(
 
 
 def to_html(document: Document, drawings: Mapping[str, bytes] | None = None) -> str:
-    """Return a document as one page of HTML that needs no other file; all text is escaped.
+    """Return a document as one HTML page that needs no other file; all text is escaped.
 
-    `drawings` are its figures as `draw_figures` returns them; without, they are drawn.
+    `drawings` are its figures as returned by `draw_figures`; by default they are drawn.
     """
     drawings = draw_figures(document, {"page": ["svg"], "column": ["svg"]}) if drawings is None else drawings
     captions, number = document.captions(), 0
@@ -240,7 +242,7 @@ def to_html(document: Document, drawings: Mapping[str, bytes] | None = None) -> 
                 opening = "<pre class='table'>" if table else "<pre>"
                 parts.append(f"{opening}{escape(text)}</pre>")
             case Picture(name):
-                # A page shows the drawing that fits.
+                # The style of the page shows the drawing that fits the screen.
                 wide, narrow = (inline(drawings[f"{name}-{width}.svg"], captions[name]) for width in ("page", "column"))
                 parts.append(
                     f"<figure><div class='wide'>{wide}</div><div class='narrow'>{narrow}</div>"
@@ -249,7 +251,7 @@ def to_html(document: Document, drawings: Mapping[str, bytes] | None = None) -> 
             case Table(header, rows, above, total, words):
                 parts.append(table_html(header, rows, above, total=total, words=words))
     title = escape(document.title)
-    # Without its script a page loses only the values under the pointer and the enlarged figures.
+    # Without JavaScript, a page lacks only values at the pointer and enlarged figures.
     return "\n".join(
         [
             "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
@@ -273,10 +275,10 @@ def write_document(
     force: bool = False,
     progress: Callable[[str | float], None] = lambda _: None,
 ) -> None:
-    """Write a document as HTML (as PDF where `output` ends in .pdf), as PDF, and its figures into a folder.
+    """Write a document to `output` as HTML, or as PDF if it ends in .pdf; to `pdf` as PDF; and its figures to a folder.
 
     Each figure is drawn once at each width; the folder has PDF and SVG of both. `progress` is called with the present
-    step, and the share that is drawn. Raises what `uwblink.output.check_output` raises.
+    step, and with the share of the figures that are drawn. Raises the errors of `uwblink.output.check_output`.
     """
     page = output if output is not None and output.suffix.lower() != ".pdf" else None
     papers = [path for path in (output if page is None else None, pdf) if path is not None]

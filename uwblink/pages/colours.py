@@ -1,8 +1,8 @@
-"""The colours of figures and pages, on white and on a dark page.
+"""The colours of figures and pages, on light and on dark pages.
 
-Any two of the first six differ by at least 15 (CIEDE2000), for normal vision and for each kind of colour blindness
-(simulated as in Machado, Oliveira and Fernandes 2009), on white and on dark ground. More than six series also differ
-by marker and dashes.
+Any two of the six colours of `SERIES` differ by at least 15 (CIEDE2000), for normal vision and for each kind of colour
+blindness (simulated as in Machado, Oliveira and Fernandes 2009), on light and on dark pages. Series also differ by
+marker and dashes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ GRID: Final = "#d8d8d8"
 PALE: Final = "#b4b4b4"
 
 SERIES: Final = (BLUE, VERMILION, GREEN, WINE, GREY, SAGE)
-"""Colours of things of one kind: tags, bodies, protocols."""
+"""Colours of series of one kind, such as tags, bodies or protocols."""
 
 DARK: Final = {
     BLUE: "#4aa8e8",
@@ -41,20 +41,20 @@ DARK: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """How one series is drawn: its colour, marker and dashes."""
+    """Colour, marker and dashes of a series."""
 
     colour: str
     marker: str
     dashes: Any
 
     def line(self, *, marker: bool = True) -> dict[str, Any]:
-        """Return it as arguments of matplotlib's `plot`."""
+        """Return the look as arguments of matplotlib's `plot`."""
         shape = {"marker": self.marker, "ms": 3.2} if marker else {}
         return {"color": self.colour, "ls": self.dashes, "lw": 1.1, **shape}
 
 
 def look(number: int) -> Look:
-    """Return the look of a series by its number: 84 different ones, 28 of them different without colours."""
+    """Return the look of a series by its number. 84 looks are different, and 28 of them also without colours."""
     markers = ("o", "s", "^", "D", "v", "P", "X")
     dashes: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
     return Look(SERIES[number % len(SERIES)], markers[number % len(markers)], dashes[number % len(dashes)])

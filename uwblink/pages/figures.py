@@ -1,4 +1,4 @@
-"""Drawing at paper size: style, sheets of panels, and the files of a drawing that is made once."""
+"""Figures at paper size: style, figures with panels, common elements, and files."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from uwblink.arrays import Floats, Ints
 from uwblink.pages.colours import BLUE, GRID, INK, MUTED
 
 WIDTHS: Final = {"column": 3.5, "page": 7.16}
-"""Widths at which figures are printed, inches: a column and both columns of an IEEE page."""
+"""Widths of printed figures in inches: one column, and both columns, of an IEEE page."""
 
 NARROW_IN: Final = 5.0
-"""Below this width panels stand above each other."""
+"""Figures below this width have their panels above each other."""
 
 STYLE: Final[Any] = {
     "font.family": "DejaVu Sans",
@@ -55,14 +55,14 @@ STYLE: Final[Any] = {
     "path.simplify": True,
     "path.simplify_threshold": 0.2,
 }
-"""Matplotlib's settings: 8 pt as journals ask for, fonts that printers take, text that stays text."""
+"""Settings of Matplotlib: text of 8 pt, as journals require; embedded TrueType fonts; text in SVG remains text."""
 
 Draw = Callable[[float], Figure]
-"""Draws a figure of a width in inches."""
+"""A function that draws a figure of a width in inches."""
 
 
 def style(**more: Any) -> AbstractContextManager[None]:
-    """Return a context in which figures are drawn and written at paper size."""
+    """Return a context manager with the settings of figures at paper size, `STYLE` and `more`."""
     return matplotlib.rc_context(STYLE | more)
 
 
@@ -75,10 +75,10 @@ def sheet(
     down: int | None = None,
     **kwargs: Any,
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure with panels: beside each other on a page's width, above each other in a column.
+    """Return a figure with `count` panels, beside each other at the width of a page, above each other in a column.
 
-    `height_in` is that of a panel. `across` and `down` set the numbers of columns and rows; panels beyond `count` are
-    hidden. `kwargs` go to matplotlib's `subplots`.
+    `height_in` is the height of a panel. `across` and `down` set the numbers of columns and rows; panels beyond `count`
+    are hidden. `kwargs` are arguments of matplotlib's `subplots`.
     """
     across = across or (1 if width_in < NARROW_IN else count)
     down = down or -(-count // across)
@@ -99,15 +99,15 @@ def label(axes: Axes, x: str, y: str) -> None:
 
 
 def legend(figure: Figure, axes: Axes | None = None, *, texts: Sequence[str] = ()) -> None:
-    """Draw the legend of some axes above the panels, in as many columns as fit; `texts` selects entries."""
+    """Draw the legend of some axes (by default the first) above the panels; `texts` selects entries."""
     handles, labels = (axes or figure.axes[0]).get_legend_handles_labels()
     kept = [k for k, text in enumerate(labels) if not texts or text in texts]
     if not kept:
         return
-    # Inches: a handle with its gaps, and a letter of 8 pt.
+    # Widths in inches of a handle with its gaps, and of a letter of 8 pt.
     width = 0.55 + 0.066 * max(len(labels[k]) for k in kept)
     columns = max(1, min(len(kept), int((figure.get_figwidth() - 0.2) / width)))
-    # Lines of a legend beyond two make the figure higher instead of its panels lower; a line takes 0.165 inches.
+    # If the legend has more than two lines, enlarge the figure, so that its panels keep their height. A line: 0.165 in.
     lines = -(-len(kept) // columns)
     figure.set_figheight(figure.get_figheight() + 0.165 * max(0, lines - 2))
     figure.legend(
@@ -127,9 +127,9 @@ def outlines(
     *,
     ends: bool = True,
 ) -> None:
-    """Draw histograms of samples (n,) in bins between edges, in per cent; `lines` are the styles of the samples.
+    """Draw histograms of samples (n,) in bins between `edges`, in per cent; `lines` are the styles of the samples.
 
-    The outermost bins include all values beyond them; with `ends` the axis is labelled so.
+    The outermost bins include all values beyond them; with `ends`, labels of the axis state that.
     """
     low, high = float(edges[0]), float(edges[-1])
     for name, values in samples.items():
@@ -146,28 +146,28 @@ def outlines(
 def series(
     axes: Axes, x: Floats, y: Floats, between: tuple[Floats, Floats] | None = None, *, band: str = "", **line: Any
 ) -> None:
-    """Draw a line, named by its label on a page, and a band between two others; `band` is the band's label."""
+    """Draw a line, and a band between two other lines if given; `band` is the label of the band."""
     if between is not None and np.any(between[1] > between[0]):
         axes.fill_between(x, *between, color=line["color"], alpha=0.25, lw=0, label=band)
     mark(axes.plot(x, y, **line)[0], line["label"])
 
 
 def dots(axes: Axes, x: Floats, y: Floats, **line: Any) -> None:
-    """Draw points (n,), smaller where there are many: of more than 3000 a part, because more show nothing more."""
+    """Draw points (n,), at most about 3000 of them; the more points, the smaller they are."""
     every = slice(None, None, max(len(x) // 3000, 1))
     size = float(np.clip(66 / np.sqrt(max(len(x), 1)), 1.2, 4.0))
     axes.plot(x[every], y[every], ".", ms=size, rasterized=True, **line)
 
 
 def bulk(values: Floats) -> tuple[float, float]:
-    """Return limits of an axis that shows values (n,) but for the outermost: reflections reach far on one side."""
+    """Return limits of an axis for values (n,) without outliers, with more room above, where reflections are."""
     low, high = np.quantile(values, (0.003, 0.985))
     margin = 0.1 * float(high - low) + 0.1
     return float(low) - margin, float(high) + margin
 
 
 def values_over_time(width_in: float, time_ns: Ints, values: Floats, name: str) -> Figure:
-    """Draw values (n,), some NaN, over their times in ns (n,), or over their numbers where all times are the same."""
+    """Draw values (n,) over times in ns (n,), or over their numbers if all times are equal; NaN is left out."""
     figure, (axes,) = sheet(width_in, height_in=1.9)
     rows = np.flatnonzero(np.isfinite(values))
     timed = len(rows) > 0 and np.ptp(time_ns[rows]) > 0
@@ -184,15 +184,15 @@ def values_over_time(width_in: float, time_ns: Ints, values: Floats, name: str) 
 
 
 def mark(artist: Any, text: str) -> None:
-    """Give a line or points a name that a page shows under the pointer."""
+    """Give a line or points a name that an HTML page shows at the pointer."""
     artist.set_gid(f"series-{text}")
 
 
 def drawn(draw: Draw, width_in: float, kinds: Iterable[str], salt: str = "") -> dict[str, bytes]:
-    """Draw once and return the files of it: "svg", "pdf" and "png".
+    """Draw a figure once and return its files by kind: "svg", "pdf" and "png".
 
-    `salt` tells apart the ids of drawings on one page. An SVG has in its metadata, as JSON, what each panel shows and
-    where, so that a page can show the values under a pointer.
+    `salt` makes the ids in drawings of one page different. The metadata of an SVG contain position, scales and labels
+    of each panel as JSON, so that a page can show the values at the pointer.
     """
     with style(**{"svg.hashsalt": salt or "uwbcal"}), warnings.catch_warnings():
         # Names of bodies may be in any script; letters that the font lacks are drawn as boxes.
@@ -200,7 +200,7 @@ def drawn(draw: Draw, width_in: float, kinds: Iterable[str], salt: str = "") -> 
         figure = draw(width_in)
         engine = figure.get_layout_engine()
         if engine is not None:
-            # Place the panels once, not once for each file.
+            # Compute the layout once for all files.
             engine.execute(figure)
             figure.set_layout_engine("none")
         return {kind: _file(figure, kind) for kind in kinds}
@@ -212,26 +212,26 @@ def picture(draw: Draw, kind: str, width_in: float = WIDTHS["page"]) -> bytes:
 
 
 def notebook_image(draw: Draw, text: str) -> str:
-    """Return a figure as an image in HTML, for notebooks; `text` stands in its place where images are not shown."""
+    """Return a figure as an image in HTML, for notebooks; `text` is its alternative text."""
     data = base64.b64encode(picture(draw, "png")).decode()
     return f'<img alt="{escape(text)}" style="width: 100%; max-width: 44em" src="data:image/png;base64,{data}">'
 
 
 def _file(figure: Figure, kind: str) -> bytes:
     data = io.BytesIO()
-    # No date in a file: the same data give the same bytes.
+    # Without dates, the same data give the same bytes.
     metadata: dict[str, Any] = {"CreationDate": None} if kind == "pdf" else {}
     if kind == "svg":
         panels = json.dumps(_panels(figure), separators=(",", ":"))
         metadata = {"Date": None, "Creator": None, "Description": panels}
-    # A PNG stands alone, on white; drawings take the ground of what they are put on. 220 dpi is for clouds of points.
+    # A PNG has a white background; SVG and PDF are transparent. 220 dpi is also that of rasterised points in these.
     ground = "white" if kind == "png" else "none"
     figure.savefig(data, format=kind, dpi=220, metadata=metadata, facecolor=ground)
     return data.getvalue()
 
 
 def _panels(figure: Figure) -> list[dict[str, Any]]:
-    """Return of each panel its box (left, top, right, bottom in points) and what its axes run over."""
+    """Return box (left, top, right, bottom, in points), limits, scales and labels of each panel."""
     width, height = 72 * figure.get_figwidth(), 72 * figure.get_figheight()
     found = []
     for axes in figure.axes:

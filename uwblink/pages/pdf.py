@@ -1,6 +1,6 @@
-"""A document as PDF on A4: ReportLab sets text and tables, pypdf inserts the figures and the outline.
+"""Documents as PDF on A4: ReportLab sets text and tables, pypdf inserts figures and the outline.
 
-Lengths are points (1/72 inch).
+Lengths are in points (1/72 inch).
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from reportlab.platypus import Table as Grid
 from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text, prose
 from uwblink.pages.figures import WIDTHS
 
-ROOM: Final = 72 * WIDTHS["page"]
-"""Width of text; figures of a page's width are printed as large as they are drawn."""
+TEXT_WIDTH: Final = 72 * WIDTHS["page"]
+"""Width of text, equal to that of figures, so that these are not scaled."""
 
 SMALL: Final = 8.0
-"""The smallest text: that of tables, notes, captions and figures."""
+"""Font size of tables, notes, captions and figures."""
 
-LISTED: Final = int((ROOM - 10) / (0.602 * SMALL))
-"""Characters in a line of a listing: DejaVu Sans Mono is 0.602 wide."""
+LISTING_COLUMNS: Final = int((TEXT_WIDTH - 10) / (0.602 * SMALL))
+"""Characters in a line of a listing: those of DejaVu Sans Mono are 0.602 font sizes wide."""
 
 FILLS: Final = {
     "lead": "#f3f5f7",
@@ -42,22 +42,22 @@ FILLS: Final = {
     "doubt": "#fff4e0",
     "bad": "#fdeaea",
 }
-"""Grounds of paragraphs, as in page.css."""
+"""Background colours of paragraphs, as in page.css."""
 
 FONTS: Final = {"sans": "DejaVuSans", "bold": "DejaVuSans-Bold", "mono": "DejaVuSansMono"}
-"""Files of Matplotlib, so that text and figures have the same font."""
+"""Font files of Matplotlib, so that text and figures have the same font."""
 
 
 Place = tuple[Block, int, float, float]
-"""A block, the number of its page from 0, and the lower left corner of its room."""
+"""A block, the number of its page from 0, and x and y of its lower left corner."""
 
 
-class _Mark(Flowable):  # type: ignore[misc] # ReportLab has no types
-    """Empty room of a height for a block, whose place it appends to `places`."""
+class _Space(Flowable):  # type: ignore[misc] # ReportLab has no types
+    """Empty space for a block, which appends the place of the block to `places` when it is drawn."""
 
     def __init__(self, block: Block, height: float, places: list[Place]) -> None:
         super().__init__()
-        self.width, self.height, self._block, self._places = ROOM, height, block, places
+        self.width, self.height, self._block, self._places = TEXT_WIDTH, height, block, places
 
     def draw(self) -> None:
         """Append the place."""
@@ -65,13 +65,13 @@ class _Mark(Flowable):  # type: ignore[misc] # ReportLab has no types
 
 
 def to_pdf(document: Document, figures: Mapping[str, bytes]) -> bytes:
-    """Return the document as PDF; `figures` are the PDFs of its figures by name, as wide as the page's text."""
+    """Return the document as PDF; `figures` are PDFs of its figures at the width of a page, by name."""
     for name, file in FONTS.items():
         registerFont(TTFont(name, Path(matplotlib.get_data_path(), "fonts", "ttf", f"{file}.ttf")))
     registerFontFamily("sans", normal="sans", bold="bold", italic="sans", boldItalic="bold")
     drawings = {name: PdfReader(io.BytesIO(data)).pages[0] for name, data in figures.items()}
     heights = {name: float(page.mediabox.height) for name, page in drawings.items()}
-    # The first time tells how many pages there are.
+    # The first pass determines the number of pages.
     count, *_ = _set(document, heights, 0)
     _, data, places = _set(document, heights, count)
     writer = PdfWriter(clone_from=data)
@@ -82,19 +82,21 @@ def to_pdf(document: Document, figures: Mapping[str, bytes]) -> bytes:
             writer.add_outline_item(title=block.text, page_number=page)
     for done in writer.pages:
         done.compress_content_streams()
-    writer.compress_identical_objects()  # each figure brings the same fonts
+    writer.compress_identical_objects()  # all figures contain the same fonts
     data = io.BytesIO()
     writer.write(data)
     return data.getvalue()
 
 
 def _set(document: Document, heights: Mapping[str, float], count: int) -> tuple[int, io.BytesIO, list[Place]]:
-    """Return the number of pages, the PDF without figures, which says that there are `count`, and places of headings
-    and figures."""
-    data, places, margin = io.BytesIO(), list[Place](), (A4[0] - ROOM) / 2
-    # The same data give the same bytes; the subtitle says when it was made.
+    """Return the number of pages, the PDF without figures, and the places of headings and figures.
+
+    The footer of each page has its number and `count`, the number of pages.
+    """
+    data, places, margin = io.BytesIO(), list[Place](), (A4[0] - TEXT_WIDTH) / 2
+    # `invariant`: no dates, so that the same data give the same bytes. The subtitle states the date.
     file = BaseDocTemplate(data, pagesize=A4, title=document.title, invariant=1, initialFontName="sans")
-    frame = Frame(margin, 45, ROOM, A4[1] - margin - 45, *[0] * 4)
+    frame = Frame(margin, 45, TEXT_WIDTH, A4[1] - margin - 45, *[0] * 4)
 
     def number(page: Any, _: Any) -> None:
         page.setFont("sans", SMALL)
@@ -106,29 +108,29 @@ def _set(document: Document, heights: Mapping[str, float], count: int) -> tuple[
 
 
 def _story(document: Document, heights: Mapping[str, float], places: list[Place]) -> Iterator[Any]:
-    """Yield what stands on the pages, one below the other."""
+    """Yield the content of the pages, from top to bottom."""
     yield from (_text(escape(document.title), 18, fontName="bold"), _text(escape(document.subtitle), SMALL))
     captions, together = document.captions(), list[Any]()
     for block in document.blocks:
         match block:
             case Heading(text):
-                # A heading stays with what follows.
-                together += [_Mark(block, 0.0, places), _text(escape(text), 13, fontName="bold", spaceBefore=9)]
+                # Keep a heading on the page of the next block.
+                together += [_Space(block, 0.0, places), _text(escape(text), 13, fontName="bold", spaceBefore=9)]
                 continue
             case Text(_, kind):
                 large, rest = map(prose, block.parts())
                 large = f'<font size="13"><b>{large}</b></font><br/>' if large else ""
                 together.append(_text(large + rest, SMALL if kind == "note" else 9.5, FILLS.get(kind)))
             case Listing(text):
-                broken = (wrap(line, LISTED, drop_whitespace=False) or [""] for line in text.split("\n"))
+                broken = (wrap(line, LISTING_COLUMNS, drop_whitespace=False) or [""] for line in text.split("\n"))
                 lines = "\n".join(chain.from_iterable(broken))
                 together.append(_text(escape(lines), SMALL, FILLS["lead"], XPreformatted, fontName="mono"))
             case Picture(name):
-                together += [_Mark(block, heights[name], places), _text(prose(captions[name]), SMALL)]
+                together += [_Space(block, heights[name], places), _text(prose(captions[name]), SMALL)]
             case Table():
                 together += _tables(block)
-        height = sum(one.wrap(ROOM, A4[1])[1] + one.getSpaceBefore() + one.getSpaceAfter() for one in together)
-        # What is higher than two thirds of a page begins where there is room for a heading and some lines.
+        height = sum(one.wrap(TEXT_WIDTH, A4[1])[1] + one.getSpaceBefore() + one.getSpaceAfter() for one in together)
+        # Blocks are kept on one page; those above two thirds of a page need only space for a heading and some lines.
         yield CondPageBreak(height if height < A4[1] * 2 / 3 else 100.0)
         yield from together
         together = []
@@ -136,7 +138,7 @@ def _story(document: Document, heights: Mapping[str, float], places: list[Place]
 
 
 def _text(html: str, size: float, fill: str | None = None, kind: Any = Paragraph, **style: Any) -> Any:
-    """Return a paragraph of HTML, on a ground."""
+    """Return a paragraph of HTML with a background colour, if any."""
     padding = 5 if fill else 0
     own = {"fontName": "sans", "spaceAfter": 8 + padding, "splitLongWords": 1, "backColor": fill}
     own |= {"borderPadding": padding, "leftIndent": padding, "rightIndent": padding}
@@ -145,19 +147,20 @@ def _text(html: str, size: float, fill: str | None = None, kind: Any = Paragraph
 
 
 def _tables(table: Table) -> Iterator[Flowable]:
-    """Yield a table, or several with the first column in common where it is wider than the page.
+    """Yield a table; if it is wider than the page, several tables that repeat the first column.
 
-    In a table of words columns above 57 points (20 mm) are made narrower, and their lines break.
+    In a table of words, or with two columns, columns above 57 points (20 mm) are made narrower instead, and their lines
+    break.
     """
     rows = [table.header, *table.rows]
     widths = [max(stringWidth(row[k], "bold", SMALL) for row in rows) + 7 for k in range(len(table.header))]
-    if sum(widths) > ROOM and (table.words or len(widths) < 3):
+    if sum(widths) > TEXT_WIDTH and (table.words or len(widths) < 3):
         wide = sum(w for w in widths if w > 57)
-        left = max(ROOM - (sum(widths) - wide), 57.0)
+        left = max(TEXT_WIDTH - (sum(widths) - wide), 57.0)
         widths = [max(w * left / wide, 20.0) if w > 57 else w for w in widths]
     parts = [[0]]
     for k in range(1, len(widths)):
-        if len(parts[-1]) > 1 and sum(widths[c] for c in parts[-1]) + widths[k] > ROOM + 0.1:
+        if len(parts[-1]) > 1 and sum(widths[c] for c in parts[-1]) + widths[k] > TEXT_WIDTH + 0.1:
             parts.append([0])
         parts[-1].append(k)
     over = [name for name, span in table.above for _ in range(span)]

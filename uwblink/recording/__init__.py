@@ -1,4 +1,4 @@
-"""The recording: file, tables, summary, and distances between its tags."""
+"""Recordings: the file and its tables, summaries, and distances between tags."""
 
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, delays_in_meta, load_antenna_delays
 from uwblink.recording.summary import IMPOSSIBLE_PPM, Summary, clock_skews, counted, target_faster_ppm

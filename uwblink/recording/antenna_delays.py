@@ -1,7 +1,7 @@
-"""Antenna delays that are programmed into devices: TOML files, a recording's `meta`, and comparisons.
+"""Antenna delays that are programmed into devices: TOML files, entries in the `meta` of recordings, comparisons.
 
 ```toml
-[antenna_delays]           # of all devices that are not named
+[antenna_delays]           # of all devices without a table of their own
 tx = 16436                 # register of the transmitter, in ticks of 15.65 ps
 rx = 16436                 # register of the receiver
 reply = 16436              # added by the firmware to the time at which it schedules a reply
@@ -30,7 +30,7 @@ from uwblink.ticks import ANTENNA_DELAY_TICKS, SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import LARGEST_ID
 
 REGISTER_MAX: Final = 65_535
-"""Antenna delays have registers of 16 bits (DW1000 User Manual 2.10, sections 7.2.25 and 7.2.40.4)."""
+"""Largest antenna delay: registers have 16 bits (DW1000 User Manual 2.10, sections 7.2.25 and 7.2.40.4)."""
 
 ALL: Final = "configured_antenna_delay_ticks"
 BY_TAG: Final = "configured_antenna_delay_ticks_by_tag"
@@ -58,12 +58,12 @@ class AntennaDelay(NamedTuple):
     reply: int = ANTENNA_DELAY_TICKS
 
     def __str__(self) -> str:
-        """Return both registers, and the constant where it differs from the transmitter's."""
+        """Return both registers, and the constant for replies if it differs from the transmitter's register."""
         return f"{self.tx}/{self.rx}" + (f", replies {self.reply}" if self.reply != self.tx else "")
 
 
 AntennaDelays = Mapping[int | None, AntennaDelay]
-"""Delays by device; None is the key for devices that are not named. A device may have none."""
+"""Delays by device; those of the key None apply to all other devices."""
 
 
 def delay_of(delays: AntennaDelays, tag: int) -> AntennaDelay | None:
@@ -77,9 +77,9 @@ def known_delays(delays: AntennaDelays, tags: Iterable[int]) -> AntennaDelays:
 
 
 def delays_in_meta(meta: Mapping[str, Any]) -> AntennaDelays:
-    """Return the delays in a recording's `meta`, which may be empty; raises `ValueError`.
+    """Return the delays in the `meta` of a recording, empty if it has none; raises `ValueError` for a wrong form.
 
-    The default of the constant for replies is the transmitter's delay.
+    The default of the constant for replies is the transmitter's register.
     """
     rows: dict[int | None, Any] = {None: meta[ALL]} if ALL in meta else {}
     wrong = f"has no usable antenna delays of its devices in {ALL}"
@@ -92,7 +92,7 @@ def delays_in_meta(meta: Mapping[str, Any]) -> AntennaDelays:
 
 
 def meta_of_delays(delays: AntennaDelays) -> dict[str, Any]:
-    """Return the entries of a recording's `meta` for delays."""
+    """Return delays as entries for the `meta` of a recording."""
     rows = {tag: one._asdict() for tag, one in delays.items()}
     for row in rows.values():
         if row["reply"] == row["tx"]:
@@ -104,11 +104,11 @@ def meta_of_delays(delays: AntennaDelays) -> dict[str, Any]:
 def read_antenna_delays(
     file: TomlReader, ticks_per_unit: Mapping[str, float] | None = None
 ) -> dict[int | None, AntennaDelay]:
-    """Return the `[antenna_delays]` of a file, none where there is none; raises the file's error, with the key.
+    """Return the section `[antenna_delays]` of a file, empty if it has none; raises the error of the file with the key.
 
-    `reply` is required for devices whose register is not 16436, because the firmware's constant does not follow from
-    the registers. With `ticks_per_unit` the section is that of another maker's devices: it has only
-    `tx` and `rx`, which are 0 where they are not given, and a `unit`, one of these names.
+    `reply` is required for devices whose transmit register is not 16436, because the firmware's constant does not
+    follow from the registers. With `ticks_per_unit` the section describes devices of another maker: it has only `tx`
+    and `rx`, 0 by default, and a `unit`, one of these names.
     """
     section, scale = file.section("antenna_delays"), None
     tags = section.pop("tags", {})
@@ -145,7 +145,7 @@ def _delay(
 
 
 def load_antenna_delays(path: Path) -> dict[int | None, AntennaDelay]:
-    """Read a file of antenna delays, as `calib export --to registers` writes it; raises `PlanError`."""
+    """Read a file of antenna delays, such as that of `calib export --to registers`; raises `PlanError`."""
     file = TomlReader(path, PlanError, "file of antenna delays (.toml)")
     file.known(file.table, ("antenna_delays",))
     found = read_antenna_delays(file)
@@ -155,7 +155,7 @@ def load_antenna_delays(path: Path) -> dict[int | None, AntennaDelay]:
 
 
 def text_of_delays(delays: AntennaDelays) -> str:
-    """Return a file of antenna delays (.toml)."""
+    """Return the text of a file of antenna delays (.toml)."""
     rows = [
         f"[antenna_delays{'' if tag is None else f'.tags.{tag}'}]\ntx = {one.tx}\nrx = {one.rx}\nreply = {one.reply}\n"
         for tag, one in delays.items()
@@ -164,10 +164,10 @@ def text_of_delays(delays: AntennaDelays) -> str:
 
 
 def delays_differ(then: AntennaDelays, now: AntennaDelays, tags: Iterable[int]) -> str:
-    """Describe differences between known delays `then` and `now` of some tags; "" for none.
+    """Return a text on differences between known delays `then` and `now` of some tags; "" for none.
 
-    A calibration fitted with other delays makes a range wrong by half of the difference of a tag's sum. The division of
-    the sum between the two registers has no effect.
+    A range contains half of the sum of a tag's registers, so a change of the sum causes half of its error in ranges.
+    The division of the sum between the two registers has no effect.
     """
     longer_m: dict[str, float] = {}
     for tag in sorted(tags):

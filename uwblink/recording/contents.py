@@ -1,4 +1,4 @@
-"""Contents of a recording in memory: as a whole, for selecting and saving, or in pieces of time."""
+"""Contents of a recording in memory: the whole recording, a selection, or pieces of time."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ READING_MB: Final = 300
 class Contents:
     """The contents of a recording; all fields but the exchanges are optional.
 
-    `overheard`, `imu`, `height`, `powers`, `quality`, `temperature`, `receptions`, `differences` and `corrected` have
-    the columns of the tables of these names, or none; `meta` are the entries of the table `meta`.
+    `overheard`, `imu`, `height`, `powers`, `quality`, `temperature`, `receptions`, `differences` and `corrected` are
+    columns by name, those of the tables with these names; `meta` are the entries of the table `meta`.
 
     >>> from uwblink import Contents, Exchanges, Tag
     >>> x = Exchanges.from_arrays([1, 2], [2, 3], tx1=[0, 9], rx1=[5, 3], tx2=[1005, 1003], rx2=[3000, 3009])
@@ -72,10 +72,9 @@ class Contents:
     ) -> Contents:
         """Return the contents from `start_s` to before `stop_s`, in seconds since the first exchange, for some tags.
 
-        `tags` selects exchanges between these tags, `pairs` those of (initiator, target). Poses are kept as far as the
-        span needs them, tags completely. Readings, bytes and faults are selected by time only. `meta` describes the
-        selection.
-        Raises `ArgumentError`.
+        `tags` selects exchanges between these tags, `pairs` those of (initiator, target). All tags are kept, and the
+        poses that the span needs. Readings, bytes and faults are selected by time only. `meta` describes the selection.
+        Raises `ArgumentError` for times and ids that are not possible.
         """
         first_ns, end_ns = self._bounds(start_s, stop_s)
         of_tags = None if tags is None else sorted(_ids("tags", [*tags]).tolist())
@@ -83,7 +82,7 @@ class Contents:
         kept = {"start_s": start_s, "stop_s": stop_s, "tags": of_tags, "pairs": of_pairs}
 
         def chosen(columns: Mapping[str, NDArray[Any]]) -> Bools:
-            """Return which rows are in the span, and where they are of two tags, of these tags and pairs."""
+            """Return a mask of rows in the span; if rows have two tags, only those of the selected tags and pairs."""
             good: Bools = (columns["time_ns"] >= first_ns) & (columns["time_ns"] < end_ns)
             if "initiator" in columns:
                 ends = np.column_stack([columns["initiator"], columns["target"]])
@@ -116,19 +115,19 @@ class Contents:
         )
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write a recording; raises what `Recording.create` raises."""
+        """Write a recording; raises the errors of `Recording.create`."""
         meta = {"timestamp_bits": self.exchanges.bits, **self.meta}
         with Recording.create(path, meta=meta, force=force) as recording:
             recording.append_tags(self.tags)
             recording.append_poses(self.poses)
-            # 500 000 at once: DuckDB holds what it has not committed in memory.
+            # In blocks, because DuckDB keeps rows in memory until they are committed.
             for start in range(0, len(self.exchanges), 500_000):
                 recording.append_exchanges(self.exchanges[start : start + 500_000])
             for table in (*_COLUMNS, *_LISTS):
                 recording.append({"known_distances": "distances"}.get(table, table), getattr(self, table))
 
     def __repr__(self) -> str:
-        """Return a headline, the numbers of other rows, and the first exchanges."""
+        """Return a headline with the numbers of rows, and the first exchanges."""
         return f"{self._line()}\n{self.exchanges!r}"
 
     def _repr_html_(self) -> str:
@@ -147,7 +146,7 @@ class Contents:
         return {"exchanges": len(self.exchanges), "poses": len(self.poses)} | columns | lists
 
     def counts(self) -> dict[str, int]:
-        """Return the number of rows by table: exchanges, and other tables that have any."""
+        """Return the number of rows by table: of exchanges, and of other tables that are not empty."""
         return {name: n for name, n in self._numbers().items() if n or name == "exchanges"}
 
     def _bounds(self, start_s: float | None, stop_s: float | None) -> tuple[int, int]:
@@ -163,16 +162,16 @@ class Contents:
 
 
 _LISTS: Final = ("cirs", "frames", "faults", "arrangements", "known_distances")
-"""The tables that are held as lists of rows."""
+"""Fields of `Contents` that are lists of rows."""
 
 _COLUMNS: Final = tuple(one.name for one in fields(Contents) if one.default_factory is dict and one.name != "meta")
-"""The tables that are held as columns by name."""
+"""Fields of `Contents` that are columns by name."""
 
 
 def load(path: str | os.PathLike[str]) -> Contents:
-    """Read a whole recording; raises what `Recording.open` raises.
+    """Read a whole recording; raises the errors of `Recording.open`.
 
-    This includes bytes and impulse responses, 2 kB each. `Recording.open` reads table by table.
+    The result includes raw bytes, and impulse responses of 2 kB each. Use `Recording.open` to read single tables.
 
     >>> import tempfile, pathlib, uwblink
     >>> folder = pathlib.Path(tempfile.mkdtemp())
@@ -200,9 +199,10 @@ def _pairs(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def pieces(recording: Recording, rows: int = 50_000) -> Iterator[Contents]:
-    """Yield consecutive pieces of time with about `rows` rows of each table.
+    """Yield consecutive pieces of time with at most about `rows` rows of each table.
 
-    Bytes, impulse responses and total powers are left out, and `corrected` if its rows are not those of the exchanges.
+    They have exchanges, poses, faults, IMU, heights and temperatures, and the rows of `corrected` if there is one for
+    each exchange; other tables are left out.
     """
     columns = ("imu", "height", "temperature", *(["corrected"] if recording.corrected_is_of_exchanges() else []))
     edges = {-LATEST_NS, LATEST_NS}
@@ -219,9 +219,9 @@ def pieces(recording: Recording, rows: int = 50_000) -> Iterator[Contents]:
 
 
 def distances_by_poses_m(recording: Recording, blocks: Iterable[Exchanges]) -> Iterator[Floats]:
-    """Yield the distances (n,) between the antennas of each block of exchanges by the poses; NaN without poses.
+    """Yield the distances (n,) between the antennas, from poses, for each block of exchanges; NaN without poses.
 
-    They are distances at the times of the ranges (`uwblink.twr.range_ns`).
+    They are distances at the times of the ranges (`uwblink.twr.range_ns`), in metres.
     """
     tracks, tags = tracks_of(recording.poses()), recording.tags()
     for some in blocks:
@@ -235,6 +235,6 @@ def exchanges_with_poses(recording: Recording) -> Iterator[tuple[Exchanges, Pose
     """
     tracks = tracks_of(recording.poses())
     for block in filter(len, recording.exchange_blocks()):
-        # A range belongs to its poll or to a time after it, by half a wrap at most.
+        # The time of a range is that of its poll, or later by at most half a wrap of the clock.
         later = int(2**block.bits * TICK_S * 0.5e9) + 1
         yield block, poses_around(tracks, int(block.time_ns.min()), int(block.time_ns.max()) + later)

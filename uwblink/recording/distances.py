@@ -1,4 +1,4 @@
-"""True distances between tags, from the poses of their bodies and their lever arms; and the clock of those poses."""
+"""True distances between tags, from poses of bodies and lever arms, and the clock offset of poses."""
 
 from __future__ import annotations
 
@@ -14,44 +14,44 @@ from uwblink.twr import Exchanges, names_in, raw_range
 
 
 class PoseTrack:
-    """One body's poses in order of time: the columns of `POSE` (7, n) at times (n,) in ns."""
+    """The poses of a body in order of time: the columns of `POSE` (7, n) at times (n,) in ns."""
 
     def __init__(self, time_ns: Ints, columns: Sequence[Floats] | Floats) -> None:
-        """Take columns in any order of time."""
+        """Sort the columns, which may have any order of time."""
         order = np.argsort(time_ns, kind="stable")
         self.time_ns, self.columns = time_ns[order], np.array([column[order] for column in columns])
         quaternion = self.columns[3:]
-        # q and -q are one attitude: signs are chosen so that each is near the one before.
+        # q and -q are the same attitude: choose signs so that each quaternion is near the previous one.
         apart = np.sum(quaternion[:, 1:] * quaternion[:, :-1], axis=0) < 0
         quaternion[:, 1:] *= np.cumprod(np.where(apart, -1.0, 1.0))
         self.columns[:, ~quaternion.any(axis=0)] = np.nan
         self._time, self._columns = self.time_ns.astype(np.float64), self.columns
         if len(order) > 2 and not np.ptp(self.columns[:3], axis=1).max() <= 0.02:
-            # Motion capture that loses a body leaves a gap; in half a second robots change their course.
+            # Motion capture that loses a body leaves a gap. In half a second, robots change their course, so a gap is
+            # not interpolated: insert NaN after its start.
             lost = np.flatnonzero((steps := np.diff(self._time)) > max(0.5e9, 10 * np.median(steps))) + 1
-            # A microsecond is more than the last digit of times since 1970.
+            # 1 us later, because float64 resolves times since 1970 to 0.3 us.
             self._time, self._columns = (
                 np.insert(self._time, lost, self._time[lost - 1] + 1000),
                 np.insert(self.columns, lost, np.nan, axis=1),
             )
 
     def point_m(self, time_ns: Ints, lever_arm_m: Floats) -> Floats:
-        """Return where a point of the body is at some times (n,), shape (3, n), NaN outside its poses.
+        """Return the position (3, n) of a point of the body in metres at times (n,), NaN outside the poses.
 
         Positions are interpolated linearly, attitudes along the chord of their quaternions; a body with a single pose
-        does not move. Gaps in the poses of a body that moves, of half a second and ten times their spacing, are
-        outside of them.
+        does not move. If the body moves, gaps of more than half a second and ten times the usual step are NaN, too.
         """
         place, attitude, known = self._at(time_ns)
         return np.where(known, place + attitude.apply(lever_arm_m).T, np.nan)
 
     def into_body(self, time_ns: Ints, vector: Floats) -> Floats:
-        """Return vectors (n, 3) of the world in the frame of the body at some times (n,), NaN outside its poses."""
+        """Return vectors (n, 3) of the world frame in the frame of the body at times (n,), NaN outside its poses."""
         _, attitude, known = self._at(time_ns)
         return np.where(known[:, None], attitude.apply(vector, inverse=True), np.nan)
 
     def turn_rad(self) -> float:
-        """Return the largest angle between the body's first known attitude and another."""
+        """Return the largest angle between the first known attitude and another, in radians; 0 without any."""
         known = self.columns[3:, np.isfinite(self.columns[3:]).all(axis=0)]
         if not known.shape[1]:
             return 0.0
@@ -59,7 +59,7 @@ class PoseTrack:
         return float(2 * np.arccos(np.clip(np.abs(unit[:, 0] @ unit).min(), 0, 1)))
 
     def _at(self, time_ns: Ints) -> tuple[Floats, Rotation, Bools]:
-        """Return places (3, n) and attitudes at some times (n,), and where they are known (n,)."""
+        """Return positions (3, n) and attitudes (n,) at times (n,), and a mask (n,) of those that are known."""
         time, outside = time_ns.astype(np.float64), None if len(self._time) == 1 else np.nan
         found = np.array([np.interp(time, self._time, column, outside, outside) for column in self._columns])
         known = np.isfinite(found).all(axis=0)
@@ -67,21 +67,21 @@ class PoseTrack:
 
 
 Tracks = dict[str, PoseTrack]
-"""The tracks of bodies that have poses."""
+"""Tracks by the name of the body."""
 
 
 def tracks_of(poses: Poses) -> Tracks:
-    """Return the tracks of the bodies that have poses."""
+    """Return the tracks of all bodies with poses."""
     columns = np.vstack([poses.position_m.T, poses.quaternion.T])
     rows = {body: poses.body == body for body in names_in(poses.body)}
     return {body: PoseTrack(poses.time_ns[some], columns[:, some]) for body, some in rows.items()}
 
 
 def poses_around(tracks: Tracks, start_ns: int, end_ns: int) -> Poses:
-    """Return the poses from `start_ns` to `end_ns`, and each body's next two on either side, in order of time.
+    """Return the poses from `start_ns` to `end_ns`, and the next two of each body on either side, in order of time.
 
-    In between positions are those of all poses. Of a body that has no poses at these times there are none, of one
-    that does not move there is its only one.
+    Interpolation within the span gives the same as with all poses. Bodies whose poses are all before or after the span
+    are left out; a single pose of a body is always included.
     """
     parts = [Poses.from_arrays([], "", (0.0, 0.0, 0.0))]
     for body, track in tracks.items():
@@ -95,11 +95,11 @@ def poses_around(tracks: Tracks, start_ns: int, end_ns: int) -> Poses:
 
 
 def distances_m(poses: Poses | Tracks, tags: Sequence[Tag], initiator: Ints, target: Ints, time_ns: Ints) -> Floats:
-    """Distance between two tags' antennas at given times, shape (n,), in metres.
+    """Return the distances between the antennas of two tags at times (n,), shape (n,), in metres.
 
-    Positions are interpolated linearly between poses, attitudes along the chord of their
-    quaternions. NaN where a tag has no lever arm, its body no poses, or the time lies outside them;
-    a body with a single pose does not move.
+    Positions are interpolated linearly between poses, attitudes along the chord of their quaternions; a body with a
+    single pose does not move. NaN for tags that are not in `tags`, for bodies without poses, and for times outside the
+    poses.
     """
     here, there = (antennas_m(poses, tags, ids, time_ns) for ids in (target, initiator))
     x, y, z = (here - there).T
@@ -109,9 +109,10 @@ def distances_m(poses: Poses | Tracks, tags: Sequence[Tag], initiator: Ints, tar
 def sights(
     poses: Poses | Tracks, tags: Sequence[Tag], initiator: Ints, target: Ints, time_ns: Ints
 ) -> tuple[Floats, Floats]:
-    """Return distances as `distances_m` (n,), and unit vectors from each antenna to the other in its body's frame.
+    """Return distances (n,) as `distances_m` does, and unit vectors (n, 2, 3) from each antenna to the other.
 
-    The vectors have shape (n, 2, 3), that of the initiator first; NaN where a distance or an attitude is not known.
+    The vectors of the initiator come first; they are in the frames of the bodies, NaN if a distance or an attitude is
+    unknown.
     """
     tracks = tracks_of(poses) if isinstance(poses, Poses) else poses
     here, there = (antennas_m(tracks, tags, ids, time_ns) for ids in (initiator, target))
@@ -129,7 +130,7 @@ def sights(
 
 
 def antennas_m(poses: Poses | Tracks, tags: Sequence[Tag], ids: Ints, time_ns: Ints) -> Floats:
-    """Return where the antennas of tags `ids` (n,) are at given times, shape (n, 3); NaN as for `distances_m`."""
+    """Return the positions (n, 3) of the antennas of tags `ids` (n,) at times (n,) in metres; NaN as `distances_m`."""
     tracks = tracks_of(poses) if isinstance(poses, Poses) else poses
     found = np.full((len(time_ns), 3), np.nan)
     for tag in tags:
@@ -140,26 +141,27 @@ def antennas_m(poses: Poses | Tracks, tags: Sequence[Tag], ids: Ints, time_ns: I
 
 
 def bodies_m(poses: Poses, body: str, time_ns: Ints) -> Floats:
-    """Return where a body is at given times (n,), shape (n, 3); NaN outside its poses."""
+    """Return the positions (n, 3) of a body at times (n,) in metres; NaN outside its poses."""
     return tracks_of(poses)[body].point_m(time_ns, np.zeros(3)).T
 
 
 def find_offset(exchanges: Exchanges, poses: Poses, tags: list[Tag], within_s: float | None = None) -> int:
-    """Return the offset in ns to add to the poses' times, from the clock of motion capture to that of the host.
+    """Return the offset in ns to add to the times of poses, from the clock of motion capture to that of the host.
 
-    Within a pair a range differs from the true distance by a constant (antenna delays) and noise, if the poses are at
-    the right time; at a wrong time it also differs by motion. The offset with the least robust spread wins, among all
-    at which at least half the exchanges lie within the poses, or those of at most `within_s` seconds. Raises
-    `ImportTableError` where none stands out.
+    At the right offset, ranges of a pair differ from the true distances by a constant (antenna delays) and noise; at
+    other offsets, motion adds to the differences. The offset with the smallest robust spread of the differences is
+    found, among offsets at which the exchanges and the poses overlap by at least half of the shorter of both, and of at
+    most `within_s` seconds. Raises `ImportTableError` if no offset has a clearly smaller spread than others.
     """
-    # 4000 exchanges tell an offset; more only take longer.
+    # 4000 exchanges suffice, and limit the time of the search.
     some = exchanges[np.unique(np.linspace(0, len(exchanges) - 1, min(len(exchanges), 4000)).astype(np.int64))]
     ranges, pair, tracks = raw_range(some), some.initiator * 65_536 + some.target, tracks_of(poses)
 
     def loss(offset_ns: int, scale_m: float | None = None) -> float:
-        """Return the Cauchy loss of ranges less distances, less each pair's median; without a scale, their spread.
+        """Return the mean Cauchy loss of ranges minus distances minus their median by pair; without a scale, the median
+        absolute value.
 
-        Infinite where less than 40 % have a distance.
+        It is infinite if less than 40 % of the ranges have a distance.
         """
         error = ranges - distances_m(tracks, tags, some.initiator, some.target, some.time_ns - offset_ns)
         good = np.isfinite(error)
@@ -174,7 +176,7 @@ def find_offset(exchanges: Exchanges, poses: Poses, tags: list[Tag], within_s: f
     low, high = begin + overlap_ns - last, end - overlap_ns - first
     if within_s is not None:
         low, high = max(low, -int(within_s * 1e9)), min(high, int(within_s * 1e9))
-    # A grid of 0.1 s, in which motion of up to 1 m/s still shows, or a coarser one of 5000 points.
+    # Steps of 0.1 s, in which a motion of 1 m/s is 10 cm, or larger steps to limit the number to 5000.
     step = max(100_000_000, (high - low) // 5000)
     offsets = range(low, high + step, step)
     spreads = np.array([loss(o) for o in offsets])
@@ -183,12 +185,12 @@ def find_offset(exchanges: Exchanges, poses: Poses, tags: list[Tag], within_s: f
             "no offset matches the poses to the exchanges; check that the file contains the bodies of the tags"
         )
     typical, best = float(np.median(spreads[np.isfinite(spreads)])), offsets[int(np.argmin(spreads))]
-    # Then the least Cauchy loss, which uses more of the data than their median: finer grids, then a parabola.
-    scale_m = max(float(spreads.min()), 1e-6)  # one exchange, or exact ranges, have no spread
+    # Then minimise the Cauchy loss, which is more efficient than the median: by finer grids, then by a parabola.
+    scale_m = max(float(spreads.min()), 1e-6)  # above 0 for a single exchange and for exact ranges
     while step > 1_000_000:
         step //= 5
         best = min(range(best - 6 * step, best + 7 * step, step), key=lambda o: loss(o, scale_m))
-    # The last grid is finer than what noise lets through, so the parabola runs over 0.1 s to either side.
+    # Noise makes the loss rough on the scale of the last grid, so the parabola is fitted over 0.1 s to either side.
     beside = 20_000_000 * np.arange(-5, 6, dtype=np.int64)
     curve, slope, _ = np.polyfit(beside * 1e-9, [loss(best + int(o), scale_m) for o in beside], 2)
     best += round(float(np.clip(-slope / (2 * curve) if curve > 0 else 0.0, -0.1, 0.1)) * 1e9)

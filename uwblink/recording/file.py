@@ -1,10 +1,10 @@
 """The recording: one DuckDB file (`.uwb`), which simulator, recorder and importers write.
 
-Column meanings are those of `uwblink.twr.Exchanges`; the tables are listed in docs/architecture.md.
+The columns of exchanges are described at `uwblink.twr.Exchanges`, all tables in docs/reference/recording.md.
 
-Only one process can open a DuckDB file for writing, and no other can open it meanwhile. The writer appends what it
-commits to a log beside the file. A reader of a recording in use copies the two and opens the copy, whose names it
-removes at once.
+If a process has opened a DuckDB file for writing, no other process can open it. The writer appends committed rows to a
+log beside the file. A reader of a recording in use copies file and log and opens the copy, whose files it unlinks at
+once.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _MISSING: Final[dict[str, tuple[Any, type]]] = {
     "BIGINT": (0, np.int64),
     "USMALLINT": (0, np.int64),
 }
-"""What stands for a missing value in a column, and the type of the column's array."""
+"""Value in place of missing ones, and type of the array, by type of the column."""
 
 _ORDER: Final = {
     "poses": "time_ns, body",
@@ -71,8 +71,8 @@ _ORDER: Final = {
 class Recording(Store):
     """An open recording. Use `create` to write and `open` to read; both are context managers.
 
-    Methods that read or append rows raise `RecordingError` if they fail. Those with `start_ns` and `end_ns` return the
-    rows from the first until before the second.
+    Methods that read or append rows raise `RecordingError` if they fail. Those with `start_ns` and `end_ns` return rows
+    with start_ns <= time_ns < end_ns.
 
     >>> import pathlib, tempfile
     >>> from uwblink import Exchanges, Recording, Tag
@@ -99,11 +99,11 @@ class Recording(Store):
         live: bool = False,
         memory_mb: int | None = None,
     ) -> Self:
-        """Start a recording beside `path`; it takes that name at the end of the `with` block without an error.
+        """Create a recording; the file is named `path` when the `with` block ends without an error.
 
-        A `live` recording has its name from the start, and keeps all appended rows after an error; otherwise nothing
-        remains. At most `memory_mb` of the written data is kept in memory. Raises `RecordingExistsError` if `path`
-        exists and not `force`, and `RecordingError` if it cannot be written.
+        After an error nothing remains. A `live` recording is named `path` from the start, and keeps all appended rows
+        after an error. At most `memory_mb` of the written data are kept in memory. Raises `RecordingExistsError` if
+        `path` exists and `force` is False, and `RecordingError` if it cannot be written.
         """
         final = Path(path)
         check_output(final, force=force, recording=True)
@@ -112,13 +112,13 @@ class Recording(Store):
         with raising(RecordingError, f"{final}: cannot be written"):
             with ExitStack() as place:
                 recording = cls._open_to_write(final, place.enter_context(place_beside(final)), memory_mb)
-                # A recording that is written again has all of it.
+                # A copy of a recording has all entries.
                 given = dict(meta or {})
                 recording.append_meta(given if "format_version" in given else standard_meta() | given)
                 if not live:
                     recording._place = place.pop_all()
                     return recording
-                # So that the tables are in the file itself, and only rows ever in the log beside it.
+                # Close and open again, so that the tables are in the file, and the log has only rows.
                 recording._complete()
             return cls._open_to_write(final, None, memory_mb)
 
@@ -126,10 +126,9 @@ class Recording(Store):
     def open(cls, path: str | os.PathLike[str], *, update: bool = False, memory_mb: int | None = None) -> Self:
         """Open a recording for reading, or to `update` it in place.
 
-        At most `memory_mb` of the read data is kept in memory; sorting can take more.
-
-        A recording in progress is opened as a copy of everything until now. Raises `RecordingMissingError` or
-        `RecordingError` (a directory, not a recording, truncated, tables or columns missing, a newer format, in use).
+        At most `memory_mb` of the read data are kept in memory; sorting can take more. If another process is writing
+        the recording, a copy of all committed rows is opened. Raises `RecordingMissingError`, `RecordingInUseError`, or
+        `RecordingError` (a directory, not a recording, truncated, tables or columns missing, a newer format).
         """
         source = Path(path)
         if not source.exists():
@@ -143,7 +142,7 @@ class Recording(Store):
             return cls._open_copy(source, memory_mb)
 
     def _check_tables(self) -> None:
-        """Check the version of the format, too."""
+        """Check tables, columns, and the version of the format; raises `RecordingError`."""
         super()._check_tables()
         version = self.meta().get("format_version")
         if not isinstance(version, int):
@@ -164,7 +163,7 @@ class Recording(Store):
         value: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close; a written file takes its name, or is removed if the block raised.
+        """Close the recording. A written file gets its name, or is removed if the block raised an error.
 
         Raises `RecordingError` if it cannot be written completely.
         """
@@ -173,7 +172,7 @@ class Recording(Store):
                 self._complete()
 
     def _complete(self) -> None:
-        """Write everything into the file, close it, and give it its name."""
+        """Write the log into the file, close it, and give it its name."""
         self.shorten_log()
         self._db.close()
         if self._partial:
@@ -192,11 +191,11 @@ class Recording(Store):
         meta: Mapping[str, Any] | None = None,
         force: bool = False,
     ) -> None:
-        """Write this recording again at `path`: every row of every table, in its order, except what is replaced.
+        """Write a copy of this recording to `path`, with all rows of all tables in their order, except those replaced.
 
-        `replacing` maps names of `TABLES` to their new content, in the form in which it is read
-        (`{"exchanges": corrected}`; an empty list for an empty table). `meta` adds entries, or replaces those
-        with the same keys. Raises what `create` raises, and `RecordingError` for an unknown table.
+        `replacing` maps names of `TABLES` to new contents, in the form in which they are read (`{"exchanges":
+        corrected}`; an empty list for an empty table). `meta` are entries to add or to replace. Raises the errors of
+        `create`, and `RecordingError` for an unknown table.
         """
         instead = dict(replacing or {})
         entries = dict(instead.get("meta", {})) | dict(meta or {})
@@ -213,14 +212,14 @@ class Recording(Store):
         meta: Mapping[str, Any] | None = None,
         force: bool = False,
     ) -> Iterator[Self]:
-        """Yield an incomplete copy: all tables except those in `without`, which the block appends.
+        """Yield a copy of all tables except those in `without`, which the block appends, also in parts.
 
-        These do not need to be in memory at once. Raises what `copy` raises.
+        Raises the errors of `copy`.
         """
         known_tables(without)
         entries = {} if "meta" in without else self.meta()
         entries |= dict(meta or {})
-        # Without a limit of memory, it would be the size of the file.
+        # Without this limit, the copy would need as much memory as the size of the file.
         with type(self).create(path, meta=entries, force=force, memory_mb=300) as written:
             for table in TABLES:
                 if table != "meta" and table not in without:
@@ -229,15 +228,15 @@ class Recording(Store):
 
     @classmethod
     def _open_copy(cls, source: Path, memory_mb: int | None) -> Self:
-        """Open a copy of a recording that another process is writing: all that it has committed.
+        """Open a copy of a recording that another process is writing, with all committed rows.
 
-        File and log belong together if the file did not change while both were copied. What is incomplete at the end of
-        the log was not committed, and DuckDB leaves it out. Raises `RecordingInUseError` if no copy can be made.
+        File and log are consistent if the file did not change while both were copied. DuckDB ignores an incomplete
+        entry at the end of the log, which was not committed. Raises `RecordingInUseError` if no copy is possible.
         """
         file, why = source.resolve(), "changes faster than it can be copied"
         try:
             with place_beside(file) as copy:
-                # The file changes once in hours: when its log is put into it.
+                # The file changes rarely, when the writer merges the log into it. Try again then.
                 for _ in range(20):
                     before = file.stat()
                     shutil.copyfile(file, copy)
@@ -256,7 +255,8 @@ class Recording(Store):
     def append(self, table: str, what: Any) -> None:
         """Append exchanges, poses, columns or rows to one of `TABLES`, in the form in which they are read.
 
-        Rows can also be mappings of the table's columns.
+        Rows can also be mappings by the names of columns. Raises `RecordingError` for an unknown table, and for values
+        that do not fit.
         """
         known_tables([table])
         if isinstance(what, Exchanges | Poses):
@@ -267,7 +267,7 @@ class Recording(Store):
         self._insert(table, what)
 
     def append_meta(self, meta: Mapping[str, Any]) -> None:
-        """Add entries to `meta`, replacing those with the same key; values are stored as JSON."""
+        """Add entries to `meta`, or replace those with the same key; values are stored as JSON."""
         for key, value in meta.items():
             with raising(RecordingError, f"{self.path}: meta {key!r}: cannot be stored as JSON", TypeError, ValueError):
                 text = json.dumps(value, sort_keys=True, allow_nan=False)
@@ -287,7 +287,7 @@ class Recording(Store):
         self.append("poses", poses)
 
     def replace_poses(self, poses: Poses, meta: Mapping[str, Any], tags: Iterable[Tag] | None = None) -> None:
-        """Replace the poses, and the tags if given."""
+        """Replace the poses, and the tags if given, and add entries to `meta`, in one transaction."""
         with self.transaction():
             self._execute("DELETE FROM poses")
             self.append_poses(poses)
@@ -307,9 +307,9 @@ class Recording(Store):
         return int(self._fetch(f"SELECT count(*) FROM {table}")[0][0])  # noqa: S608 - a key of TABLES
 
     def tally(self, table: str, *columns: str) -> dict[tuple[Any, ...], int]:
-        """Return the number of rows of one of `TABLES` by the values of some columns, in ascending order.
+        """Return the number of rows of one of `TABLES` for each combination of values of some columns.
 
-        Rows with a missing value are left out.
+        Keys are in ascending order. Rows with a missing value in these columns are left out.
         """
         known_tables([table])
         there = " AND ".join(f"{name} IS NOT NULL" for name in columns)
@@ -317,13 +317,13 @@ class Recording(Store):
         return {tuple(row[:-1]): int(row[-1]) for row in self._fetch(query)}
 
     def exchanges(self, start_ns: int | None = None, end_ns: int | None = None) -> Exchanges:
-        """Return all exchanges in the order in which they were written."""
+        """Return the exchanges in the order in which they were written."""
         return self._exchanges(_within(start_ns, end_ns))
 
     def exchange_blocks(self, rows: int = 131_072) -> Iterator[Exchanges]:
-        """Return all exchanges in the same order, about so many `rows` at once.
+        """Return all exchanges in the same order, in blocks of `rows`.
 
-        By default these are a little more than a row group of DuckDB (122880).
+        The default is slightly more than a row group of DuckDB (122,880).
         """
         return map(self._exchanges, self._blocks("exchanges", rows))
 
@@ -349,9 +349,9 @@ class Recording(Store):
         )
 
     def dividing_times(self, table: str, rows: int) -> list[int]:
-        """Return the first and the last time of one of `TABLES`, and times between that leave about `rows` rows apart.
+        """Return times that divide one of `TABLES` into parts of about `rows` rows, with the first and the last time.
 
-        An empty table has none.
+        The list is empty for an empty table.
         """
         parts = max(self.count(table) // rows, 1)
         shares = [part / parts for part in range(parts + 1)]
@@ -359,9 +359,9 @@ class Recording(Store):
         return sorted(set(found or []))
 
     def poses(self, start_ns: int | None = None, end_ns: int | None = None) -> Poses:
-        """Return all poses in order of time.
+        """Return the poses in order of time.
 
-        Raises `RecordingError` for a body without a name, and for a pose without a time.
+        Raises `RecordingError` for a body without a name and for a pose without a time.
         """
         if self._fetch("SELECT 1 FROM poses WHERE body IS NULL OR time_ns IS NULL LIMIT 1"):
             raise RecordingError(f"{self.path}: table poses: a body without a name, or a pose without a time")
@@ -370,9 +370,9 @@ class Recording(Store):
         return Poses(r["time_ns"], r["body"], position, quaternion)
 
     def columns(self, table: str, start_ns: int | None = None, end_ns: int | None = None) -> Columns:
-        """Return one of `TABLES` as columns (n,) by name, in order of time.
+        """Return one of `TABLES` as columns (n,) by name, in order of time; `corrected` in the order of exchanges.
 
-        `corrected` is in the order of the exchanges. Missing values are "", False, NaN or 0.
+        Missing values become "", False, NaN or 0.
         """
         known_tables([table])
         found = self._select(_query(table, start_ns, end_ns))
@@ -402,9 +402,9 @@ class Recording(Store):
         return [Fault(*row) for row in self._rows("faults", start_ns, end_ns)]
 
     def arrangements(self) -> list[Arrangement]:
-        """Return the spans of time in which boards stood still, in order of time; none in older files.
+        """Return the arrangements, spans of time in which boards stood still, in order of time.
 
-        Raises `RecordingError` for unknown shapes, and for orders of tags that are not on a line.
+        Raises `RecordingError` if the column `known` is neither a word nor a line with the order of its tags.
         """
         found = []
         for start_ns, end_ns, name, known in self._rows("arrangements"):
@@ -418,13 +418,13 @@ class Recording(Store):
         return found
 
     def known_distances(self) -> list[KnownDistance]:
-        """Return the independently measured distances between tags, in order of tags; none in older files."""
+        """Return the independently measured distances between tags, in order of tags."""
         return [KnownDistance(*row) for row in self._rows("distances")]
 
     def _rows(self, table: str, start_ns: int | None = None, end_ns: int | None = None) -> list[tuple[Any, ...]]:
         """Return the rows of a table in its order; raises `RecordingError` for a missing value."""
         rows = self._fetch(_query(table, start_ns, end_ns))
-        needed = 4 if table == "faults" else None  # all but the ends of the exchange, which most faults lack
+        needed = 4 if table == "faults" else None  # initiator and target of faults may be missing
         if empty := [row for row in rows if None in row[:needed]]:
             raise RecordingError(f"{self.path}: table {table}: a row with nothing in one of its columns, {empty[0]}")
         return rows
@@ -451,13 +451,13 @@ def _column(kind: str, values: tuple[Any, ...]) -> NDArray[Any]:
 
 
 def _filled(kind: str, column: NDArray[Any]) -> NDArray[Any]:
-    """Return a column of one of DuckDB's types with a value in place of missing ones."""
+    """Return a column of a type of DuckDB with the value of `_MISSING` in place of missing ones."""
     missing, dtype = _MISSING.get(kind, (None, np.object_))
     return np.asarray(np.ma.filled(column, missing), dtype=dtype)
 
 
 def known_tables(names: Iterable[str]) -> None:
-    """Raise `RecordingError` for a table that recordings do not have."""
+    """Raise `RecordingError` if a name is not one of `TABLES`."""
     if unknown := set(names) - TABLES.keys():
         raise RecordingError(f"no table {min(unknown)!r} in a recording; there are {', '.join(TABLES)}")
 
@@ -469,7 +469,7 @@ def _query(table: str, start_ns: int | None, end_ns: int | None) -> str:
 
 
 def _within(start_ns: int | None, end_ns: int | None) -> str:
-    """Return the clause of a query for a span of time, of which either end may be open."""
+    """Return the WHERE clause for a span of time; None is an open end."""
     ends = ((">=", start_ns), ("<", end_ns))
     given = [f"time_ns {sign} {int(time_ns)}" for sign, time_ns in ends if time_ns is not None]
     return f"WHERE {' AND '.join(given)}" if given else ""

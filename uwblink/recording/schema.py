@@ -1,4 +1,4 @@
-"""The tables and columns of a recording, the rows that are not exchanges, and the tags in TOML files."""
+"""The tables and columns of a recording, classes for rows of tables, and tags in TOML files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FORMAT_VERSION: Final = 1
 SUFFIX: Final = ".uwb"
 
 POSE: Final = ("x", "y", "z", "qx", "qy", "qz", "qw")
-"""The columns of a pose besides time and body: a position in metres and a quaternion."""
+"""The columns of a pose in addition to time and body: position in metres and quaternion."""
 
 TABLES: Final[dict[str, dict[str, str]]] = {
     "meta": {"key": "VARCHAR", "value": "VARCHAR"},
@@ -104,7 +104,7 @@ TABLES: Final[dict[str, dict[str, str]]] = {
 
 TRUTH_FROM: Final = "truth_from"
 BY_POSES: Final = "poses"
-"""The column of exported exchanges with the origin of `truth_m`, and its value for distances by poses."""
+"""The column of exported exchanges with the source of `truth_m`, and its value for distances from poses."""
 
 ADDED_LATER: Final = {
     "faults": frozenset({"initiator", "target"}),
@@ -124,12 +124,12 @@ ADDED_LATER: Final = {
         )
     },
 }
-"""Columns that older recordings may lack; if these are all columns of a table, the table."""
+"""Columns that older recordings may lack, by table; a table whose columns are all listed may be missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tag:
-    """The place of a tag: its body, and its lever arm in that body's frame in metres.
+    """A tag on a body; its lever arm, the position of its antenna, is in the frame of the body, in metres.
 
     >>> from uwblink import Tag
     >>> Tag(1, "drone", (0.17, -0.17, -0.05)).body
@@ -145,8 +145,8 @@ class Tag:
 class Poses(ColumnTable):
     """Poses of bodies as columns of length n, in order of time.
 
-    `position_m` (n, 3) is r_iw_a, the body's position resolved in the world frame (ENU);
-    `quaternion` (n, 4), order x y z w, rotates body vectors into the world frame.
+    `position_m` (n, 3) is the position of the body in the world frame (east, north, up); `quaternion` (n, 4), in the
+    order x y z w, rotates vectors from the body frame to the world frame.
     """
 
     time_ns: Ints
@@ -158,10 +158,10 @@ class Poses(ColumnTable):
     def from_arrays(
         cls, time_ns: ArrayLike, body: ArrayLike, position_m: ArrayLike, quaternion: ArrayLike | None = None
     ) -> Poses:
-        """Return poses from lists or arrays, in order of time; one body, position or attitude stands for all rows.
+        """Return poses from lists or arrays, in order of time; one body, position or attitude applies to all rows.
 
-        Without `quaternion` bodies are not rotated. Quaternions are normalised. Raises `ArgumentError` with the column
-        and the row.
+        Without `quaternion` bodies are not rotated. Quaternions are normalised. Raises `ArgumentError` that names the
+        column and the row of a wrong value.
 
         >>> from uwblink import Poses
         >>> poses = Poses.from_arrays([2, 1], "drone", [[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
@@ -177,7 +177,7 @@ class Poses(ColumnTable):
         return cls(time, arrays.words("body", body, count), position, attitude / norm[:, None]).in_time_order()
 
     def to_dict(self) -> dict[str, NDArray[Any]]:
-        """Return the columns of the table `poses` by name, (n,) each, as data frames take them.
+        """Return the columns (n,) of the table `poses` by name, for data frames.
 
         >>> from uwblink import Poses
         >>> [*Poses.from_arrays([0], "drone", [0.0, 0.0, 1.0]).to_dict()]
@@ -192,7 +192,7 @@ class Poses(ColumnTable):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """An event of a recording such as a time-out, garbage, or a failed exchange.
+    """An event during a recording, such as a time-out, unreadable bytes, or a failed exchange.
 
     `initiator` and `target` are those of a failed exchange, None for other faults.
     """
@@ -211,9 +211,10 @@ SHAPES: Final = ("", "line", "plane")
 
 @dataclass(frozen=True, slots=True)
 class Arrangement:
-    """A span of time in which boards stood still: its name, and whether on a "line" or a "plane" ("": not known).
+    """A span of time in which boards stood still, with a name.
 
-    `order` are the tags in their order along a line, from either end; empty if unknown.
+    `known` is their shape, "line", "plane", or "" if unknown; `order` are the tags in their order along a line, from
+    either end, empty if unknown.
 
     >>> from uwblink import Arrangement
     >>> Arrangement("A", 0, 60_000_000_000, "line", (3, 1, 2)).order
@@ -229,7 +230,7 @@ class Arrangement:
 
 @dataclass(frozen=True, slots=True)
 class KnownDistance:
-    """An independently measured distance between two tags' antennas (tape, laser), and its standard deviation.
+    """An independently measured distance between the antennas of two tags, and its standard deviation, in metres.
 
     It is valid in one arrangement, or in all if `arrangement` is "".
 
@@ -249,7 +250,8 @@ class KnownDistance:
 class CirRow:
     """A channel impulse response that a board printed.
 
-    `first_path_index` counts taps of 1.0016 ns, with a fraction; `magnitudes` are the taps' (1016 of a board).
+    `first_path_index` is the position of the first path in taps of 1.0016 ns, with a fraction; `magnitudes` are those
+    of the taps, 1016 on a board.
     """
 
     time_ns: int
@@ -262,7 +264,7 @@ class CirRow:
 
 @dataclass(frozen=True, slots=True)
 class FrameRow:
-    """Bytes at a port: `board` is the port's name, `direction` is "in" from the board or "out" to it."""
+    """Raw bytes of a port: `board` is the name of the port, `direction` is "in" (from the board) or "out" (to it)."""
 
     time_ns: int
     board: str
@@ -271,14 +273,15 @@ class FrameRow:
 
 
 def load_places(path: Path) -> tuple[tuple[Tag, ...], dict[int, tuple[float, float, float]]]:
-    """Read the `[[tags]]` of a plan, a scenario or another file, and the places in metres of its `[[anchors]]`, by id.
+    """Read the `[[tags]]` of a plan, scenario or other file, and the positions of its `[[anchors]]` in metres, by id.
 
-    Anchors stand still. One may have `covariance_m2` (xx xy xz yy yz zz), as `calib survey --anchors` writes it; poses
-    have no place for it. Raises `PlanError` where there are neither, or an id is there twice.
+    Anchors stand still. An anchor may have `covariance_m2` (xx xy xz yy yz zz), as written by `calib survey
+    --save-anchors`; it is checked and not used, because poses have no covariance. Raises `PlanError` if there are
+    neither tags nor anchors, or an id is repeated.
     """
     file = TomlReader(path, PlanError, "file of tags (.toml)")
     if not _is_scenario(file):
-        # A ranging plan says where tags sit, too.
+        # A ranging plan has tags, too.
         plan = ("pairs", "rate_hz", "protocol", "target_reports", "get_cir", "antenna_delays")
         file.known(file.table, ("tags", "anchors", *plan))
     tags, rows = read_tags(file), file.rows("anchors", ("id", "position_m", "covariance_m2"))
@@ -294,9 +297,9 @@ def load_places(path: Path) -> tuple[tuple[Tag, ...], dict[int, tuple[float, flo
 
 
 def read_tags(file: TomlReader) -> tuple[Tag, ...]:
-    """Return tags from the array of tables `tags` of a file, none where there is none; raises the file's error.
+    """Return tags from the array of tables `tags` of a file, empty if there is none; raises the error of the file.
 
-    The tags of a scenario have more keys, which its own reader checks.
+    Tags of a scenario have more keys, which the reader of scenarios checks.
     """
     tags: list[Tag] = []
     for k, row in enumerate(file.rows("tags", None if _is_scenario(file) else ("id", "body", "lever_arm_m"))):
@@ -314,7 +317,7 @@ def _point(file: TomlReader, key: str, value: Any) -> tuple[float, float, float]
 
 
 def _new_id(file: TomlReader, key: str, row: dict[str, Any], taken: set[int]) -> int:
-    """Return the id of a tag or an anchor; raises the file's error for one that is none, or is taken."""
+    """Return the id of a tag or an anchor; raises the error of the file if it is not an id, or is in `taken`."""
     number: Any = row.get("id")
     file.check(key, number, is_id(number), f"a whole number 0 to {LARGEST_ID}")
     file.check(key, number, number not in taken, "another id than those before")
@@ -322,7 +325,7 @@ def _new_id(file: TomlReader, key: str, row: dict[str, Any], taken: set[int]) ->
 
 
 def _is_scenario(file: TomlReader) -> bool:
-    """Return whether a file is a scenario: only those have bodies or a run."""
+    """Return whether a file is a scenario, which has bodies or a run."""
     return "bodies" in file.table or "run" in file.table
 
 
@@ -331,11 +334,11 @@ def _are_numbers(value: Any, count: int) -> bool:
 
 
 LARGEST_BOARD_ID: Final = 254
-"""The firmware's ids have eight bits, and 255 is not used; those of other boards have 16."""
+"""Largest id of boards with the firmware: its ids have eight bits, and 255 is not used. Other boards have 16 bits."""
 
 
 def is_id(value: Any, largest: int = LARGEST_ID) -> bool:
-    """Whether a value can be the id of a tag."""
+    """Return whether a value can be the id of a tag."""
     return type(value) is int and 0 <= value <= largest
 
 

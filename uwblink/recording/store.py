@@ -1,10 +1,10 @@
-"""A DuckDB file of tables: SQL in, rows and columns out, and every error with the file's name.
+"""A DuckDB file of tables: queries, rows and columns, with errors that name the file.
 
-Files may come from anyone, so they are data: they are opened read-only, without access to other files and with locked
-settings, and are checked before anything in them is read: their lock, their length, and that they hold tables alone. A
-DuckDB file can also have views, macros, types and defaults. These are programs, which run when they are read, and a
-macro can even replace a function of the database. So the catalogue is checked first, by names that a file cannot
-redefine (`system.main.`), and a file with any of them is refused.
+Files may come from untrusted sources. They are opened read-only, without access to other files and with locked
+settings, and lock, length and catalogue are checked before data are read. A DuckDB file can contain views, macros,
+types and defaults. These are programs that run when the file is read, and a macro can replace a function of the
+database. So the catalogue is checked first, by names that a file cannot redefine (`system.main.`), and a file with any
+of these objects is refused.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from uwblink.output import is_utf8
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
 
 _UNFIT: Final = (duckdb.DataError, duckdb.InvalidInputException, duckdb.BinderException)
-"""DuckDB's errors for values that do not fit into a table; other errors are of the file."""
+"""Errors of DuckDB for values that do not fit into a table; its other errors concern the file."""
 
 Ask = Callable[[str], list[tuple[Any, ...]]]
-"""Executes a query and returns its rows."""
+"""A function that executes a query and returns its rows."""
 
 MOST_META_BYTES: Final = 64_000_000
-"""Bytes of text in `meta`: a thousand times what a simulated flight with its scenario has."""
+"""Largest number of bytes in `meta`: a thousand times that of a simulated flight with its scenario."""
 
 ROWS_OF_ANY_FILE: Final = 20_000_000
-"""Rows that any file may hold. Further rows take at least two bytes each in a file: stamps and powers are noise, which
-does not compress. A file with more rows was made to exhaust memory."""
+"""Number of rows that are accepted in any file. More rows must have at least two bytes each in the file, because stamps
+and powers contain noise, which does not compress; other files could be made to exhaust memory."""
 
 _REFUSED: Final = (
-    # Macros first, because older versions of DuckDB would take a macro of the file for what the others ask.
+    # Macros first: in older versions of DuckDB, a macro of the file could replace functions in the next queries.
     ("a macro", "function_name", "duckdb_functions() WHERE NOT internal"),
     ("a schema", "schema_name", "duckdb_schemas() WHERE NOT internal"),
     ("a view", "view_name", "duckdb_views() WHERE NOT internal"),
@@ -52,31 +52,31 @@ _REFUSED: Final = (
         "table_name || '.' || column_name",
         "duckdb_columns() WHERE NOT internal AND column_default IS NOT NULL",
     ),
-    # What runs when somebody writes to a table; triggers came with DuckDB 2.0.
+    # Triggers exist from DuckDB 2.0 on.
     *([("a trigger", "trigger_name", "duckdb_triggers()")] if not duckdb.__version__.startswith("1.") else []),
     ("a constraint", "constraint_text", "duckdb_constraints()"),
     ("an index", "index_name", "duckdb_indexes()"),
 )
-"""Objects that recordings do not have: a word, and the column and the function of DuckDB with their names."""
+"""Objects that recordings do not have: kind, and the column and the table function of DuckDB that name them."""
 
 COLUMNS_OF_FILE: Final = (
     "SELECT table_name, column_name, data_type FROM system.main.duckdb_columns() "
     "WHERE NOT internal AND schema_name = 'main'"
 )
-"""The query for a file's columns, by names that the file cannot redefine."""
+"""The query for the columns of a file, by names that the file cannot redefine."""
 
 _ROWS: Final = "SELECT table_name, estimated_size FROM system.main.duckdb_tables() WHERE NOT internal"
-"""The query for the number of rows of its tables."""
+"""The query for the numbers of rows of the tables of a file."""
 
 IMPORTED_AS: Final = {
     **dict.fromkeys((".csv", ".tsv", ".txt", ".gz", ".parquet", ".jsonl", ".ndjson"), "csv"),
     **dict.fromkeys((".bag", ".mcap", ".db3"), "bag"),
 }
-"""Endings of files in other formats, and the importer that reads them."""
+"""Importers by the suffix of files in other formats."""
 
 
 def check_tables(ask: Ask, path: Path, size: int, tables: Mapping[str, Mapping[str, str]]) -> None:
-    """Raise `RecordingError` for a file of `size` bytes that holds programs, or other columns than `tables` have."""
+    """Raise `RecordingError` if a file of `size` bytes contains programs, columns of other types, or too many rows."""
     for word, column, source in _REFUSED:
         if found := ask(f"SELECT {column} FROM system.main.{source}"):  # noqa: S608 - constants
             raise RecordingError(
@@ -98,7 +98,7 @@ def check_tables(ask: Ask, path: Path, size: int, tables: Mapping[str, Mapping[s
 
 
 def check_intake(ask: Ask, path: Path, size: int) -> None:
-    """Raise `RecordingError` for a file of `size` bytes with anything in it that is not data of a recording."""
+    """Raise the errors of `check_tables` for the tables of recordings, and `RecordingError` for a too large `meta`."""
     check_tables(ask, path, size, TABLES)
     if ask(f"{_ROWS} AND table_name = 'meta'"):
         ((length,),) = ask("SELECT coalesce(sum(strlen(key) + strlen(value)), 0)::HUGEINT FROM meta")
@@ -108,7 +108,7 @@ def check_intake(ask: Ask, path: Path, size: int) -> None:
 
 @contextmanager
 def interrupted_after(seconds: float, interrupt: Callable[[], None]) -> Iterator[None]:
-    """Call `interrupt` if the block takes longer than that; DuckDB then raises `InterruptException`."""
+    """Call `interrupt` if the block takes more than some seconds; DuckDB then raises `InterruptException`."""
     watch = Timer(seconds, interrupt)
     watch.daemon = True
     watch.start()
@@ -119,9 +119,9 @@ def interrupted_after(seconds: float, interrupt: Callable[[], None]) -> Iterator
 
 
 def decode_json(text: object, path: Path, key: str) -> Any:
-    """Return a value of `meta`.
+    """Return the value of an entry of `meta`.
 
-    Raises `RecordingError` for what is no JSON, not finite (NaN, 1e400), or nested too deeply.
+    Raises `RecordingError` if the text is not JSON, not finite (NaN, 1e400), or nested too deeply.
     """
     if not isinstance(text, str):
         raise RecordingError(f"{path}: table meta: {printable(key)} has no value")
@@ -133,7 +133,7 @@ def decode_json(text: object, path: Path, key: str) -> Any:
 
 
 def is_locked(path: Path, *, update: bool) -> bool:
-    """Whether another process holds the lock that DuckDB takes on a file it writes, or reads."""
+    """Return whether another process has locked a file: for writing, or with `update` also for reading."""
     if not path.is_file():  # opening a FIFO would wait
         return False
     try:
@@ -143,13 +143,13 @@ def is_locked(path: Path, *, update: bool) -> bool:
             fcntl.lockf(file, (fcntl.LOCK_EX if update else fcntl.LOCK_SH) | fcntl.LOCK_NB)
     except (BlockingIOError, PermissionError):
         return True
-    except (OSError, ImportError):  # without fcntl, on no POSIX system, opening the file reports the lock
+    except (OSError, ImportError):  # systems without fcntl (not POSIX) report the lock when the file is opened
         return False
     return False
 
 
 def damaged(path: Path, error: Exception) -> RecordingError:
-    """Return what to raise for a file that DuckDB cannot open."""
+    """Return the error to raise for a file that DuckDB cannot open."""
     if "version number" not in str(error):
         return _no_recording(path, first_line(error))
     with path.open("rb") as file:  # the first header has the version of its writer in bytes 52 to 83
@@ -168,17 +168,17 @@ def _no_recording(path: Path, seen: str) -> RecordingError:
 
 
 def check_name(path: Path) -> None:
-    """Raise `RecordingError` for a name that DuckDB cannot take."""
+    """Raise `RecordingError` for a path that DuckDB cannot open, one that is not UTF-8."""
     if not is_utf8(path):
         raise RecordingError(f"{path}: its name and those of its folders must be UTF-8; give another one")
 
 
 def check_length(path: Path) -> None:
-    """Raise `RecordingError` for a file that was cut: DuckDB's are headers and whole blocks, and may still open.
+    """Raise `RecordingError` for a truncated file, which DuckDB may still open.
 
-    Three headers of 4096 bytes come first; the smallest block has 16384 bytes, and every larger one a multiple of it.
-    Beside a log a file may have any length: a disk that was full while the log was put into it leaves half a block at
-    its end, to which nothing refers, and everything is in the log.
+    A file has three headers of 4096 bytes and whole blocks of 16,384 bytes or a multiple of it. If there is a log, any
+    length is accepted: a disk that was full during the merge of the log leaves a partial block at the end of the file,
+    which is not used, and all data are in the log.
     """
     log = log_of(path)
     if not (log.exists() and log.stat().st_size) and path.stat().st_size % 16_384 != 3 * 4096:
@@ -186,7 +186,7 @@ def check_length(path: Path) -> None:
 
 
 class Store:
-    """An open file with the tables of `TABLES`, on which `Recording` is built; `path` is its name in messages."""
+    """An open file with the tables of `TABLES`, the base of `Recording`; `path` is its name in messages."""
 
     def __init__(
         self,
@@ -197,28 +197,29 @@ class Store:
         size: int = 0,
         partial: Path | None = None,
     ) -> None:
-        """Wrap an open connection to a file of `size` bytes, which limits the time of reading.
+        """Take an open connection to a file of `size` bytes, which limits the time of a query.
 
-        `writes`: the file is open for writing. `partial` is the file that takes the name `path` when it is complete.
+        `writes` states whether the file is open for writing. `partial` is the file that is renamed to `path` when it is
+        complete.
         """
         self._db, self.path, self._writes, self._partial = connection, path, writes, partial
-        # A minute, and 1 s for each 500 kB, which is a hundredth of the speed of a slow disk.
+        # A minute, and 1 s for each 500 kB, a hundredth of the speed of a slow disk.
         self._longest_read_s = 60.0 + size / 500_000.0
         self._place = ExitStack()
-        """The folder of `partial`, which is removed at the end."""
+        """Removes the folder of `partial` at the end."""
 
     @classmethod
     def _open_to_write(cls, path: Path, partial: Path | None, memory_mb: int | None = None) -> Self:
-        """Open or make the file `partial`, or else `path`, for a recording called `path`; raises `RecordingError`.
+        """Open or create the file `partial`, by default `path`, for a recording called `path`; raises `RecordingError`.
 
-        A reader that checks a file which was just made holds it for a moment: the writer waits up to two seconds.
+        A reader that checks a new file locks it for a moment, so the writer waits up to two seconds for the lock.
         """
         check_name(path)
         place = partial or path
         end_s = time.monotonic() + 2.0
         while True:
             try:
-                # Snapshots are written beside the recording, and nothing is ever written elsewhere.
+                # DuckDB may write only in the folder of the recording.
                 db = connect(place, folders=[place.parent], memory_mb=memory_mb)
                 break
             except duckdb.Error as error:
@@ -231,10 +232,10 @@ class Store:
 
     @classmethod
     def _open_to_read(cls, path: Path, *, update: bool, memory_mb: int | None = None) -> Self:
-        """Open a file for reading, or to `update` it; raises `RecordingError` if it is none, or is in use.
+        """Open a file for reading, or to `update` it; raises `RecordingError` if it is not a recording, or is in use.
 
-        At most `memory_mb` of what was read, and of what a query works on, is kept in memory, by default most of what
-        there is; a file that is open in this program already keeps the limit with which it was opened.
+        Queries and read data use at most `memory_mb` of memory, by default most of the computer's. If the file is
+        already open in this program, its first limit remains.
         """
         check_name(path)
         check_length(path)
@@ -263,25 +264,25 @@ class Store:
         return store
 
     def shorten_log(self) -> None:
-        """Write the log into the file, also while other threads write; raises `RecordingError`.
+        """Merge the log into the file, also while other threads write; raises `RecordingError`.
 
-        Closing does so too, but does not report failures.
+        Closing a connection also merges the log, but does not report failures.
         """
         with self._writing(), self._db.cursor() as db:
             db.execute("CHECKPOINT")
 
     def _execute(self, statement: str, values: list[Any] | None = None) -> None:
-        """Execute a statement of SQL; raises `RecordingError` where the file cannot be written."""
+        """Execute an SQL statement; raises `RecordingError` if the file cannot be written."""
         with self._writing():
             self._db.execute(statement, values)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Raise `RecordingError` for what DuckDB raises where the file cannot be written."""
+        """Raise `RecordingError` for errors of DuckDB that concern the file."""
         try:
             yield
         except _UNFIT:
-            raise  # `_insert` knows of which table
+            raise  # `_insert` adds the name of the table
         except duckdb.Error as error:
             disk = isinstance(error, duckdb.IOException | duckdb.TransactionException | duckdb.FatalException)
             reason = f"{first_line(error)}){'; is the disk full?' if disk else ';'}"
@@ -293,9 +294,9 @@ class Store:
             ) from error
 
     def _insert(self, table: str, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Add rows from columns with the table's names; masked values are missing in the table.
+        """Add rows from columns by the names of the table's columns; masked values are missing in the table.
 
-        Raises `RecordingError` for values that do not fit into the table.
+        Raises `RecordingError` for columns of different lengths, and for values that do not fit into the table.
         """
         names = [name for name in TABLES[table] if name in columns]
         lengths = {name: len(columns[name]) for name in names}
@@ -317,7 +318,7 @@ class Store:
         self._db.unregister("batch")
 
     def _select(self, query: str) -> Columns:
-        """Return the result of a query as columns, masked where values are missing; raises `RecordingError`."""
+        """Return the result of a query as columns, in which missing values are masked; raises `RecordingError`."""
         with self._reading():
             return dict(self._db.execute(query).fetchnumpy())
 
@@ -337,20 +338,20 @@ class Store:
             raise RecordingError(f"{self.path}: cannot be read, truncated or damaged ({why})") from error
 
     def _blocks(self, table: str, rows: int) -> Iterator[str]:
-        """Yield conditions of queries for all rows of a table in their order, some at a time."""
+        """Yield WHERE clauses for blocks of rows of a table, in their order."""
         ((last,),) = self._fetch(f"SELECT coalesce(max(rowid), -1) FROM {table}")  # noqa: S608 - a key of TABLES
         for start in range(0, last + 1, rows):
             yield f"WHERE rowid >= {start} AND rowid < {start + rows}"
 
     def _take(self, source: Store, table: str) -> None:
-        """Add all rows of another file's table in their order, missing values included, some at a time."""
-        # 100 000 impulse responses, which are the largest rows, take 0.2 GB.
+        """Add all rows of a table of another file in their order, in blocks, with missing values."""
+        # 100,000 impulse responses, the largest rows, need 0.2 GB.
         for block in source._blocks(table, 100_000):
             self._insert(table, source._select(f"SELECT {', '.join(TABLES[table])} FROM {table} {block}"))  # noqa: S608 - keys of TABLES
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Return a context: everything inserted in it is written at once, or not at all; raises `RecordingError`."""
+        """Return a context manager in which all insertions are one transaction; raises `RecordingError`."""
         try:
             self._execute("BEGIN")
             yield
@@ -361,16 +362,16 @@ class Store:
             raise
 
     def _create(self) -> None:
-        """Create the tables that the file does not have: all in a new one, later ones in an older one."""
+        """Create the tables that the file lacks."""
         with self.transaction():
             for table, columns in TABLES.items():
                 spec = ", ".join(f"{name} {kind}" for name, kind in columns.items())
                 self._execute(f"CREATE TABLE IF NOT EXISTS {table} ({spec})")
 
     def _check_tables(self) -> None:
-        """Raise `RecordingError` where the file lacks a table or column that every recording has.
+        """Raise `RecordingError` if the file lacks a table or column that is not in `ADDED_LATER`.
 
-        Later ones are read as empty ones in memory; a file that is written gets its later columns.
+        Those in `ADDED_LATER` are created: empty in a temporary table, or in the file if it is open for writing.
         """
         present: dict[str, set[str]] = {table: set() for table in TABLES}
         for table, column, _kind in self._fetch(COLUMNS_OF_FILE):
@@ -390,15 +391,15 @@ class Store:
 
 
 def _value(name: str, kind: str, column: NDArray[Any], arrays: dict[str, NDArray[Any]], bound: list[Any]) -> str:
-    """Return the SQL of a column's values; adds to `arrays` the arrays to scan, and to `bound` the bound values."""
+    """Return the SQL expression of a column; adds arrays to scan to `arrays`, and bound values to `bound`."""
     arrays[name], value = np.ascontiguousarray(np.ma.getdata(column)), f'"{name}"'
     if arrays[name].dtype.kind == "U":
-        # DuckDB would sort an array of words, which takes longer than the rest of an insertion.
+        # Insert words as indices of a bound list: DuckDB would sort an array of words, which takes most of the time.
         words, which = np.unique(arrays[name], return_inverse=True)
         bound.append(words.tolist())
         arrays[name], value = which + 1, f'CAST(? AS VARCHAR[])["{name}"]'
     if kind == "BLOB":
-        # Not every version takes bytes from an array; all take digits.
+        # Some versions of DuckDB cannot read bytes from an array; all can read hexadecimal digits.
         arrays[name] = np.array([data.hex() for data in arrays[name].tolist()], dtype=object)
         value = f'unhex("{name}")'
     if np.ma.is_masked(column):

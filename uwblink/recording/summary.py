@@ -1,8 +1,8 @@
-"""Summary of a recording, as text, HTML and JSON; its exchanges without second reports, and the rates of its clocks.
+"""Summaries of recordings as text, HTML and JSON, exchanges without second reports, and relative clock rates.
 
-If targets report too, a recording has each exchange twice. Both boards report the same stamps, so that pair and a stamp
-of either clock identify two reports of one exchange. The first report is used. Differences of the second one are
-faults, because both are of the same frames.
+If targets report, too, a recording has two reports of each exchange. Both contain the same stamps, so the pair and a
+stamp of either clock identify reports of the same exchange. The initiator's report is used. Other values in the second
+one are faults, because both are of the same frames.
 """
 
 from __future__ import annotations
@@ -24,24 +24,25 @@ if TYPE_CHECKING:
     from uwblink.recording.file import Recording
 
 IMPOSSIBLE_PPM: Final = 1000.0
-"""A larger skew is due to a damaged stamp: boards differ by up to 40 ppm (20 ppm each, DW1000 data sheet, table 7)."""
+"""Skews above this are due to damaged stamps: clock rates differ by up to 40 ppm (20 ppm each, DW1000 data sheet, table
+7)."""
 
 
 SIGNS: Final = {True: "same sign", False: "OTHER SIGN", None: ""}
-"""Words for whether the skews by stamps and by carriers have the same sign; None: too small to tell."""
+"""Words for `ClockSkew.same_sign`, whether skews by stamps and by carriers have the same sign; None: too small."""
 
 APART_NS: Final = 60_000_000
-"""Largest time between reports of one exchange; stamps of others can be equal after the wrap, 67 ms."""
+"""Largest time between two reports of one exchange. Stamps of 32 bits repeat after 67 ms."""
 
 COMPARED: Final = (*STAMPS, "range_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
-"""Columns that both reports have in common."""
+"""Columns that are equal in both reports of an exchange."""
 
 
 @dataclass(frozen=True, slots=True)
 class SingleReports:
-    """Exchanges without second reports, in their order; `repeated` is the number of those.
+    """Exchanges without second reports, in their order; `repeated` is the number of second reports.
 
-    `differing` (k, 2) are the rows of reports that differ, the initiator's first, among the given exchanges.
+    `differing` (k, 2) are the rows of reports with different values among the given exchanges, the initiator's first.
     """
 
     exchanges: Exchanges
@@ -52,7 +53,7 @@ class SingleReports:
 def single_reports(exchanges: Exchanges) -> SingleReports:
     """Return each exchange once: the initiator's report if there is one, else the target's."""
     e, partner = exchanges, np.full(len(exchanges), -1, dtype=np.int64)
-    for name in ("tx2", "tx1"):  # a stamp of each clock, in case that one is damaged
+    for name in ("tx2", "tx1"):  # a stamp of each clock, because one may be damaged
         one, other = _neighbours(e, [getattr(e, name), e.target, e.initiator])
         theirs = np.where(e.reporter[one] == e.target[one], one, other)
         mine = one + other - theirs
@@ -68,10 +69,10 @@ def single_reports(exchanges: Exchanges) -> SingleReports:
 
 
 def repeated_rows(exchanges: Exchanges) -> Bools:
-    """Return which exchanges (n,) repeat another row of the same pair and reporter in all stamps and readings.
+    """Return a mask (n,) of exchanges with the pair, reporter, stamps and readings of an earlier row.
 
-    Ranges without stamps must also have the same time, to a millisecond: readings of a centimetre and a decibel are
-    soon equal by chance.
+    Ranges without stamps must also have times within a millisecond, because readings that are rounded to a centimetre
+    and a decibel are often equal by chance.
     """
     e = exchanges
     columns = [e.initiator, e.target, e.reporter, *(getattr(e, name) for name in COMPARED)]
@@ -83,7 +84,7 @@ def repeated_rows(exchanges: Exchanges) -> Bools:
 
 
 def _neighbours(e: Exchanges, columns: Sequence[NDArray[Any]]) -> tuple[Ints, Ints]:
-    """Return rows that are equal in some columns, each (k,) with the next in time."""
+    """Return pairs of rows (k,), (k,) that are equal in some columns and successive in time."""
     order = np.lexsort((e.time_ns, *columns))
     same = np.all([np.diff(column[order]) == 0 for column in columns], axis=0)
     return order[:-1][same], order[1:][same]
@@ -100,7 +101,7 @@ def single_report_blocks(recording: Recording) -> Iterator[SingleReports]:
 
 
 def differences(exchanges: Exchanges, first: int, second: int) -> list[str]:
-    """Return the differences of two reports, one text for each column: "range_m 3.0122 and 3.0177"."""
+    """Return the differences of two reports, one text per column, such as "range_m 3.0122 and 3.0177"."""
     pairs = [(name, getattr(exchanges, name)) for name in COMPARED]
     rows = np.array([first]), np.array([second])
     return [f"{name} {column[first]} and {column[second]}" for name, column in pairs if _unequal(column, *rows)[0]]
@@ -115,10 +116,10 @@ def _unequal(column: Ints, first: Ints, second: Ints) -> Bools:
 class ClockSkew:
     """Relative rate of the clocks of a pair, the smaller id first, in ppm; positive if the second clock is faster.
 
-    `stamps_ppm` is that by the third leg of `count` exchanges, `carrier_ppm` by readings of the carriers, None without
-    any; `residual_ppm` is the scatter of readings about their median. `slope`, the ratio of the second to the first,
-    and `same_sign` are None if the skew is too small. `drift_ppm` is by how much the skew by stamps grows from the
-    first tenth of the exchanges to the last, as crystals that warm up drift.
+    `stamps_ppm` is the median skew by the stamps of `count` exchanges with three messages. `carrier_ppm` is the median
+    of readings of the carrier integrators, and `residual_ppm` their spread; None without readings. `slope` is
+    `carrier_ppm` / `stamps_ppm`; it and `same_sign` are None if the skew is too small. `drift_ppm` is the change of the
+    skew by stamps from the first tenth of the exchanges to the last, for example while crystals warm up.
     """
 
     pair: str
@@ -142,8 +143,9 @@ class ClockSkew:
 def target_faster_ppm(exchanges: Exchanges) -> Floats:
     """Return the rate of the target's clock relative to the initiator's in ppm, by stamps of three messages (n,).
 
-    Not finite for exchanges of two messages. Two messages of one sender have the same distance in time at the receiver:
-    the second and the third if the target sends both, else the first and the third. Antenna delays cancel.
+    It is not finite for exchanges of two messages. The interval between two messages of one sender, measured by both
+    clocks, gives the rate: the second and third message if the target sends both, else the first and third. Antenna
+    delays cancel.
     """
     spans = intervals(exchanges)
     from_target = of_protocol(exchanges.protocol, lambda row: row.third_sender == "target")
@@ -154,9 +156,9 @@ def target_faster_ppm(exchanges: Exchanges) -> Floats:
 
 
 def clock_skews(exchanges: Exchanges | Iterable[Exchanges]) -> list[ClockSkew]:
-    """Return the skew of every pair with at least five double-sided exchanges, in the pairs' order.
+    """Return the skew of every pair with at least five exchanges of three messages, in the order of pairs.
 
-    `exchanges` are all of them, or blocks as from `Recording.exchange_blocks`.
+    `exchanges` are all exchanges, or blocks such as those of `Recording.exchange_blocks`.
     """
     found = [np.empty((3, 0))]
     for some in [exchanges] if isinstance(exchanges, Exchanges) else exchanges:
@@ -174,9 +176,9 @@ def clock_skews(exchanges: Exchanges | Iterable[Exchanges]) -> list[ClockSkew]:
 def _skew(pair: int, by_stamps: Floats, by_carriers: Floats) -> ClockSkew:
     stamps, known = float(np.median(by_stamps)), by_carriers[np.isfinite(by_carriers)]
     carrier = float(np.median(known)) if len(known) else None
-    # Between 16 and 84 percent lies one standard deviation to either side.
+    # The 16 % and 84 % quantiles of a normal distribution are one standard deviation from the mean.
     spread = float(np.ptp(np.percentile(known, (16, 84)))) / 2 if len(known) else None
-    # The sign of a skew below 0.5 ppm cannot be compared with readings of the carriers, which scatter by 0.2 ppm.
+    # Readings of the carriers have a noise of 0.2 ppm, so signs of skews below 0.5 ppm are not compared.
     slope = None if carrier is None or abs(stamps) <= 0.5 else carrier / stamps
     sign = None if slope is None else slope > 0
     tenth = len(by_stamps) // 10 + 1
@@ -185,7 +187,7 @@ def _skew(pair: int, by_stamps: Floats, by_carriers: Floats) -> ClockSkew:
 
 
 def skew_summary(skews: Sequence[ClockSkew]) -> str:
-    """Return pairs' skews in one line: how well carriers agree with stamps, and how many pairs have the other sign."""
+    """Return a line on the skews of pairs: agreement of carriers and stamps, number of pairs with another sign."""
     slopes = [one.slope for one in skews if one.slope is not None]
     if not slopes:
         return f"{len(skews)} pairs by the stamps, no carriers to compare with"
@@ -197,7 +199,10 @@ def skew_summary(skews: Sequence[ClockSkew]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class PairSummary:
-    """Numbers of recorded and of failed exchanges of a pair, and their rate (None: all at one time)."""
+    """Numbers of recorded and of failed exchanges of a pair, and the rate of the recorded ones.
+
+    The rate is None if all exchanges of the recording have the same time.
+    """
 
     initiator: int
     target: int
@@ -207,7 +212,7 @@ class PairSummary:
 
     @property
     def success(self) -> float | None:
-        """Return the share of exchanges that did not fail, None without exchanges."""
+        """The share of exchanges that did not fail, None without exchanges."""
         tried = self.exchanges + self.failed
         return self.exchanges / tried if tried else None
 
@@ -216,10 +221,10 @@ class PairSummary:
 class Summary:
     """Summary of a recording: rows by table, tags, pairs, exchanges by protocol, faults by kind, poses by body.
 
-    An exchange counts once: `reported_twice` is the number of exchanges with reports of both ends, `contradictory` that
-    of those with different reports. `span_s` is the time from the first to the last exchange, or difference of arrival;
-    `provenance` are the entries of `meta` without scenario and planted values. `skews` are those of pairs with
-    double-sided exchanges.
+    Exchanges with two reports are counted once: `reported_twice` is their number, and `contradictory` the number of
+    those with different reports. `span_s` is the time from the first to the last exchange, or difference of arrival if
+    there are no exchanges; `provenance` are the entries of `meta` without scenario and planted values. `skews` are
+    those of pairs with exchanges of three messages.
     """
 
     file: str
@@ -241,7 +246,7 @@ class Summary:
         return asdict(self) | {"tags": tags, "pairs": [asdict(pair) for pair in self.pairs]}
 
     def headline(self) -> str:
-        """Return file, number of exchanges (or differences, where there is none), span and protocols in one line."""
+        """Return file, number of exchanges (or of differences, if there are none), span and protocols in one line."""
         kind = "differences" if self.counts["differences"] and not self.counts["exchanges"] else "exchanges"
         protocols = f", protocols {counted(self.protocols)}" if kind == "exchanges" else ""
         return f"{printable(self.file)}: {self.counts[kind]} {kind} in {self.span_s:.1f} s{protocols}"
@@ -269,7 +274,7 @@ class Summary:
         ]
 
     def lines(self) -> list[str]:
-        """Return lines about what the tables do not show: exchanges with two reports, poses, faults, other tables."""
+        """Return lines on data that are not in `tables`: exchanges with two reports, poses, faults, other tables."""
         rows = {
             name: n for name, n in self.counts.items() if n and name not in ("exchanges", "tags", "poses", "faults")
         }
@@ -300,7 +305,7 @@ class Summary:
 
 
 def summarize(recording: Recording) -> Summary:
-    """Return the summary of a recording, which is read in blocks; raises what its readers raise."""
+    """Return the summary of a recording, which is read in blocks; raises `RecordingError` if that fails."""
     pairs, protocols, times = Counter[tuple[int, int]](), Counter[str](), list[int]()
     repeated = contradictory = 0
 
@@ -345,13 +350,13 @@ def _words(found: Mapping[tuple[Any, ...], int]) -> dict[str, int]:
 
 
 def failures_by_pair(faults: list[Fault]) -> dict[tuple[int, int], int]:
-    """Count failed exchanges by (initiator, target)."""
+    """Return the number of failed exchanges by (initiator, target)."""
     ends = ((fault.initiator, fault.target) for fault in faults)
     return dict(Counter((i, j) for i, j in ends if i is not None and j is not None))
 
 
 def counted(counts: Mapping[str, int]) -> str:
-    """Return names with their numbers, or `none`."""
+    """Return names with their numbers as a text, "none" without any."""
     return ", ".join(f"{printable(name)} {count}" for name, count in counts.items()) or "none"
 
 

@@ -1,4 +1,4 @@
-"""Scenarios fitted to recordings, and how well they fit."""
+"""Twins: scenarios fitted to recordings, and the comparison of both."""
 
 from uwbsim.twins.fitting import TWIN_LEVEL, Compared, Side, Twin, check_name
 

@@ -1,8 +1,9 @@
-"""Rates of all tags' clocks over time, jointly from ratios of stamps and from carrier readings of all pairs.
+"""Rates of the clocks of all tags over time, from ratios of stamps and carrier readings of all pairs.
 
-A linear Gaussian model: each clock's rate is a random walk between knots, each ratio dt64/dt53 and each carrier reading
-the difference of two rates with noise. Deviations of walks and noises are what makes the data most likely, by
-expectation and maximization (Shumway and Stoffer 1982, there with a Kalman smoother, here in one system of equations).
+The model is linear and Gaussian: the rate of each clock is a random walk between knots; each ratio dt64/dt53 and each
+carrier reading is the difference of two rates plus noise. The standard deviations of walks and noise maximise the
+likelihood, by the EM algorithm (Shumway and Stoffer 1982; they use a Kalman smoother, here one system of equations is
+solved).
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ from uwbsim.twins.flight import TwinFlight
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockFit:
-    """Fitted clocks: rates in ppm at the start and random walks in ppm per root of a second, (tags,) each.
+    """Fitted clocks: rates at the start in ppm, and random walks in ppm per root of a second, (tags,) each.
 
-    Clocks ran faster by `warm_up_ppm` (tags,) at first, which decayed with the time constant `warm_up_s`, None where
-    none did. The mean of all rates at the start, without that, is zero by choice: nothing in a recording says what true
-    time is. `noise_ppm` and `bias_ppm` (2,) are those of ratios and of carrier readings. `receive_noise_s` (n,) is what
-    the rates leave of ratios, as noise of a single receive stamp, NaN where there is no ratio.
+    At first, clocks run faster by `warm_up_ppm` (tags,), which decays with the time constant `warm_up_s`, None if no
+    warm-up was fitted. The mean of all rates at the start, without the warm-up, is zero by convention, because a
+    recording does not determine true time. `noise_ppm` and `bias_ppm` (2,) are those of ratios and of carrier readings.
+    `receive_noise_s` (n,) are the residuals of the ratios, converted to noise of a single receive stamp; NaN without a
+    ratio.
     """
 
     skew_ppm: Floats
@@ -40,31 +42,31 @@ class ClockFit:
 
 
 def fit_clocks(flight: TwinFlight) -> ClockFit:
-    """Fit the clocks of a flight; with warming up where walks would have to be long without."""
-    found = _Search(flight, None)
+    """Fit the clocks of a flight; with a warm-up if random walks would be large without it."""
+    found = _ClockSearch(flight, None)
     span = float(flight.time_s[-1])
     # A clock that walks further than 0.15 ppm over a flight may be warming up.
     if np.max(found.walk) * np.sqrt(span) > 0.15:
-        tries = [_Search(flight, decay) for decay in (10.0, 25.0, 60.0) if decay < 2 * span]
+        tries = [_ClockSearch(flight, decay) for decay in (10.0, 25.0, 60.0) if decay < 2 * span]
         best = min(tries, key=lambda one: float(np.sum(np.log(one.walk))), default=found)
-        # Each clock pays for its warming up with a walk that is shorter by more than one number explains.
-        shorter = float(np.sum(np.log(found.walk / best.walk))) * (best.knots - 1)
-        if shorter > 3 * len(flight.tags) and best.warmed_up() > 3:
+        # The log likelihood of a walk contains -(knots - 1) log(walk). It must grow by 3 per clock (a judgement).
+        gain = float(np.sum(np.log(found.walk / best.walk))) * (best.knots - 1)
+        if gain > 3 * len(flight.tags) and best.warm_up_ratio() > 3:
             found = best
     return found.result()
 
 
-class _Search:
-    """Expectation and maximization, with clocks that warm up with the time constant `decay_s`, or do not.
+class _ClockSearch:
+    """The EM algorithm for clocks with a warm-up of the time constant `decay_s`, or without (None).
 
-    The unknowns are the rates of all clocks at the knots, how much each warms up, and the biases of both kinds of
-    readings: 0 are ratios, 1 carriers.
+    The unknowns are the rates of all clocks at the knots, the warm-up of each, and the biases of both kinds of
+    measurement: 0 are ratios, 1 carrier readings.
     """
 
     def __init__(self, flight: TwinFlight, decay_s: float | None) -> None:
         self.tags, span = len(flight.tags), max(float(flight.time_s[-1]), 1e-3)
         self.flight, self.decay_s = flight, decay_s
-        # Knots half a second apart at least, and 300 unknown rates in all at most.
+        # Knots are at least half a second apart; at most 300 rates are unknown.
         self.knots = int(np.clip(min(300 // self.tags, span / 0.5), 2, 400))
         self.step_s = span / (self.knots - 1)
         self._read()
@@ -77,9 +79,10 @@ class _Search:
                 break
 
     def _read(self) -> None:
-        """Line up ratios and carriers: differences of rates (m,) by `design` (m, unknowns), of kind 0 or 1.
+        """Set `value` (m,), ratios and carrier readings in ppm, `kind` (m,), 0 or 1, and `design` (m, unknowns).
 
-        Carriers read by the target are positive where it is faster. Rates are linear between knots, and warm up.
+        A carrier reading at the target is positive if the target's clock is faster. Rates are linear between knots,
+        plus the warm-up.
         """
         count, x, (first, second) = self.tags * self.knots, self.flight.exchanges, self.flight.ends
         values = np.concatenate([self.flight.ratio_ppm, x.skew1_ppm, x.skew2_ppm])
@@ -98,8 +101,8 @@ class _Search:
         self.design = csr_array((np.concatenate(entries), place), shape=(len(rows), count + self.tags + 2))
 
     def _update(self) -> None:
-        """Find the most likely unknowns and their covariance, then the noises and walks expected with them."""
-        # Readings five standard deviations off are left out.
+        """Compute the posterior of the unknowns (E step), then the standard deviations of noise and walks (M step)."""
+        # Leave out measurements more than five standard deviations off.
         kept = np.abs(self.left) < 5 * self.noise[self.kind]
         parts = [np.flatnonzero(kept & (self.kind == k)) for k in (0, 1)]
         grams = [(self.design[rows].T @ self.design[rows]).toarray() for rows in parts]
@@ -110,7 +113,7 @@ class _Search:
         self.left = self.value - self.design @ self.found
         for k, (rows, gram) in enumerate(zip(parts, grams, strict=True)):
             if len(rows):
-                # Their scatter, and what the model leaves open.
+                # Expected square of the noise: square of the residual plus the variance of the fitted value.
                 self.noise[k] = np.sqrt((np.sum(self.left[rows] ** 2) + np.sum(gram * self.covariance)) / len(rows))
         self.walk = self._walks()
 
@@ -118,16 +121,20 @@ class _Search:
         knots, tags = self.knots, self.tags
         difference = np.diff(np.eye(knots), axis=0)
         stiffness = difference.T @ difference / self.step_s
-        warm = np.full(tags, 1e12 if self.decay_s is None else 5.0**-2)  # clocks run some 5 ppm faster at first
-        # A bias that no reading determines is zero.
+        # Prior standard deviation of the warm-up: 5 ppm (a judgement); without a warm-up it is fixed to zero.
+        warm = np.full(tags, 1e12 if self.decay_s is None else 5.0**-2)
+        # The weak prior of the biases makes one zero that no measurement determines.
         prior = block_diag(*[stiffness / walk**2 for walk in self.walk], np.diag(warm), 1e-6 * np.eye(2))
-        # The mean of the rates at the start is zero, tightly.
+        # Fix the mean of the rates at the start to zero.
         start = np.arange(tags) * knots
         prior[np.ix_(start, start)] += 1e6
         return np.asarray(prior)
 
     def _walks(self) -> Floats:
-        """Return the deviations of the walks that expected steps have, each clock's with one of the average's."""
+        """Return the standard deviations of the walks (tags,), from the expected squares of their steps.
+
+        Each clock has one more step with the mean square of all clocks, as a weak prior.
+        """
         count = self.tags * self.knots
         rates = self.found[:count].reshape(self.tags, self.knots)
         own = self.covariance[:count, :count].reshape(self.tags, self.knots, self.tags, self.knots)
@@ -137,20 +144,21 @@ class _Search:
         variance = steps.sum(axis=1)
         return np.asarray(np.sqrt((variance + steps.mean()) / self.knots / self.step_s))
 
-    def warmed_up(self) -> float:
-        """Return the largest warm-up of a clock, less the median of all, in units of what its walk does meanwhile."""
+    def warm_up_ratio(self) -> float:
+        """Return the largest warm-up minus the median of all, relative to the clock's walk within the time constant."""
         warm = self.found[self.tags * self.knots : -2]
         return float(np.max(np.abs(warm - np.median(warm)) / (self.walk * np.sqrt(self.decay_s or 1.0))))
 
     def result(self) -> ClockFit:
-        """Return what was found."""
-        count, ratio = self.tags * self.knots, np.full(len(self.flight), np.nan)
+        """Return the fitted clocks."""
+        count, residual_ppm = self.tags * self.knots, np.full(len(self.flight), np.nan)
         ratios = np.flatnonzero(self.kind == 0)
-        # The rates follow the ratios a little; what is left is scaled to the noise that is most likely.
+        # Residuals are smaller than the noise, because the rates follow the ratios: scale them to the noise.
         left, noise = self.left[ratios], self.noise[0]
         inside = left[np.abs(left) < 5 * noise]
-        ratio[np.isfinite(self.flight.ratio_ppm)] = left * noise / np.sqrt(np.mean(inside**2)) if len(left) else left
-        # A ratio has the noise of two receptions of the same tag, over dt53.
+        scaled = left * noise / np.sqrt(np.mean(inside**2)) if len(left) else left
+        residual_ppm[np.isfinite(self.flight.ratio_ppm)] = scaled
+        # A ratio has the noise of two receptions of the same tag, divided by dt53.
         span_s = intervals(self.flight.exchanges).dt53 * TICK_S
         return ClockFit(
             skew_ppm=self.found[: count : self.knots],
@@ -160,5 +168,5 @@ class _Search:
             warm_up_s=self.decay_s,
             noise_ppm=self.noise,
             bias_ppm=self.found[-2:],
-            receive_noise_s=np.asarray(ratio * 1e-6 * span_s / np.sqrt(2)),
+            receive_noise_s=np.asarray(residual_ppm * 1e-6 * span_s / np.sqrt(2)),
         )

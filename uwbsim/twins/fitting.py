@@ -44,10 +44,10 @@ TWIN_LEVEL: Final = 0.01
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Side:
-    """One quantity in a recording or in its twin: `count` values, their quantiles at 10, 50 and 90 %.
+    """One quantity in a recording or in its twin: the number of values, and their quantiles at 10, 50 and 90 %.
 
-    `lag1` is the autocorrelation of consecutive values of a pair, about the mean of all, with a standard error; `worth`
-    is the effective number of independent values.
+    `lag1` is the autocorrelation of consecutive values of a pair, about the mean of all, and `lag1_std` its standard
+    error; `worth` is the effective number of independent values.
     """
 
     count: int
@@ -60,7 +60,7 @@ class Side:
 
     @classmethod
     def of(cls, values: Floats, pair: Ints) -> Self:
-        """Return the figures of values (n,) of pairs (n,), in order of time."""
+        """Return the statistics of values (n,) of pairs (n,), in order of time."""
         low, middle, high = np.quantile(values, [0.1, 0.5, 0.9]).tolist()
         lag1, error = lag_one(values, pair)
         worth = effective_size(values, pair)
@@ -71,10 +71,10 @@ class Side:
 class Compared:
     """One quantity in a recording and in its twin.
 
-    `distance` is the largest difference of the cumulative distributions, and `probability` its p-value (Kolmogorov and
-    Smirnov, with the effective numbers of values); `lag1_probability` is that of the difference of the autocorrelations
-    (normal). `detectable` and `lag1_detectable` are the differences that are detected in nine of ten such recordings.
-    `drawn` are some values of both sides, for figures; `pairs` both sides by pair.
+    `distance` is the largest difference of the cumulative distributions, and `probability` its p-value (test of
+    Kolmogorov and Smirnov, with the effective numbers of values). `lag1_probability` is the p-value of the difference
+    of the autocorrelations (normal). `detectable` and `lag1_detectable` are the differences that are detected with a
+    probability of 90 %. `drawn` are some values of both sides, for figures; `pairs` are both sides by pair.
     """
 
     name: str
@@ -91,17 +91,18 @@ class Compared:
 
     @property
     def verdict(self) -> str:
-        """Return "differ" for a significant difference, else "alike", or "too few" if a large one were not detected.
+        """Return "differ" for a significant difference, "alike" for none, or "too few" if large ones are undetectable.
 
-        A large difference of distributions is 0.2, that of two normal ones whose means are half a standard deviation
-        apart; of autocorrelations 0.4. Each of the two tests has half of `TWIN_LEVEL`.
+        A large difference of distributions is 0.2, as of two normal distributions whose means differ by half a standard
+        deviation; a large difference of autocorrelations is 0.4 (judgements). Each of the two tests has half of
+        `TWIN_LEVEL`.
         """
         if min(self.probability, np.nan_to_num(self.lag1_probability, nan=1.0)) < TWIN_LEVEL / 2:
             return "differ"
         return "alike" if self.detectable <= 0.2 and self.lag1_detectable <= 0.4 else "too few"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the figures, JSON-ready, without the values; NaN is None."""
+        """Return the statistics for JSON, without the values; NaN becomes None."""
         own = ("name", "unit", "distance", "probability", "detectable", "lag1_probability", "lag1_detectable")
         found = {name: _finite_or_none(getattr(self, name)) for name in own} | _both_sides(
             self.measured, self.simulated
@@ -133,9 +134,10 @@ QUANTITIES: Final[dict[str, tuple[str, Callable[[TwinFlight], Floats]]]] = {
 
 
 def _compared(name: str, measured: TwinFlight, flights: list[TwinFlight]) -> Compared | None:
+    """Compare a quantity of a flight with that of simulated flights; None if there are too few values."""
     unit, column = QUANTITIES[name]
     mine, group = _finite(column(measured), measured.pair)
-    # A seed's pairs are pairs of their own.
+    # Pairs of different seeds are different groups.
     named = {pair: k for k, pair in enumerate(measured.pairs)}
     numbers = [np.array([named.get(pair, -1) for pair in flight.pairs], dtype=np.int64) for flight in flights]
     parts = [_finite(column(flight), number[flight.pair]) for flight, number in zip(flights, numbers, strict=True)]
@@ -152,7 +154,8 @@ def _compared(name: str, measured: TwinFlight, flights: list[TwinFlight]) -> Com
     distance = float(ks_2samp(mine, theirs, method="asymp").statistic)
     root = np.sqrt(1 / (1 / one.worth + 1 / other.worth))
     spread = float(np.hypot(one.lag1_std, other.lag1_std))
-    # A share has the standard deviation 1/2 at most; 1.28 of them leave a tenth below.
+    # A difference is detected with a probability of 90 % if it exceeds the critical value by 1.28 standard deviations.
+    # That of a share is at most 1/2 (times 1/root).
     tenth = float(-ndtri(0.1))
     return Compared(
         name=name,
@@ -209,8 +212,8 @@ class Twin:
     def compare(self, seeds: int | None = None, progress: Callable[[float], None] | None = None) -> list[Compared]:
         """Simulate the twin with a number of seeds, and compare its distributions with those of the recording.
 
-        Without `seeds` there are as many as make 6000 simulated exchanges or more, eight at most. Raises
-        `ParameterError` for less than one.
+        The default of `seeds` gives at least 6000 simulated exchanges, with at most eight seeds. Raises
+        `ParameterError` if `seeds` is not a whole number above 0.
         """
         if seeds is not None and (isinstance(seeds, bool) or not isinstance(seeds, int) or seeds < 1):
             raise ParameterError(f"found {seeds!r}, expected a whole number from 1 on", parameter="seeds")
@@ -225,12 +228,12 @@ class Twin:
         return [one for one in found if one is not None]
 
     def files(self, output: str | os.PathLike[str]) -> tuple[Path, ...]:
-        """Return the names of what `save` writes: the scenario, and beside it its poses and its plan where needed."""
+        """Return the files that `save` writes: the scenario, and files of its poses and of its plan if it has them."""
         path, parts = Path(output), {".poses.uwb": self.paths, ".plan.csv": self.table["ranging"].get("plan")}
         return (path, *(path.with_suffix(suffix) for suffix, part in parts.items() if part))
 
     def save(self, output: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write the scenario (.toml) and what it names; raises what `check_output` raises, with nothing written."""
+        """Write the scenario (.toml) and the files that it names; raises the errors of `check_output` before that."""
         path, table = Path(output), dict(self.table)
         check_name(path)
         for file in self.files(path):
@@ -249,24 +252,24 @@ class Twin:
             table["ranging"] = table["ranging"] | {"plan": {"file": plan.name}}
         head = (
             f"The twin of {Path(self.measured.where).name} with {Path(self.known.where).name}: fitted to it by "
-            "`uwbsim twin`, which also wrote the files that it names. Keys that are left out have their defaults."
+            "`uwbsim twin`, which also wrote the files named here. Missing keys have their defaults."
         )
         write_text(path, scenario_text(table, head), force=force)
 
     def __repr__(self) -> str:
-        """Return what was found, a line each."""
+        """Return the fitted values, one per line."""
         head = f"Twin of {self.measured.where}: {len(self.measured)} exchanges of {len(self.measured.pairs)} pairs"
         values = (f"  {name}: {value:.4g}" for name, value in self.found.items() if isinstance(value, float))
         return "\n".join([head, *values])
 
 
 def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
-    """Fit a scenario to a recording, with delays and bias curve of a calibration as the truth.
+    """Fit a scenario to a recording; the delays and the bias curve of a calibration are taken as true.
 
-    `recording` is a file (.uwb) or its contents in memory (`uwblink.Contents`, a simulated flight); `calibration` its
-    file (.json), its JSON as nested tables, or a `calib.Calibration`. The recording needs poses, first-path powers
-    and some hundred exchanges. Raises `ScenarioError` if these are missing or the calibration lacks a tag, and what
-    `Recording.open` raises.
+    `recording` is a file (.uwb) or its contents in memory (`uwblink.Contents`, such as a simulated flight);
+    `calibration` is a file (.json), its JSON as nested tables, or a `calib.Calibration`. The recording needs poses,
+    first-path powers and at least 100 exchanges. Raises `ScenarioError` if these are missing or the calibration lacks a
+    tag, and the errors of `Recording.open`.
 
     >>> import calib
     >>> import uwbsim
@@ -287,9 +290,9 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
     known = read_calibration(calibration)
     flown, where = read_flight(recording)
     flight = TwinFlight.of(flown, known, where)
-    # One thread: the same bytes on any machine, and small matrices are quicker so.
+    # With one thread, results are the same bytes on any machine, and small matrices are faster.
     with threadpool_limits(limits=1, user_api="blas"):
-        # More than 50,000 exchanges would only take longer for clocks and powers.
+        # For clocks and powers, 50,000 exchanges are enough; more take longer.
         rows = flight.some(50_000)
         clocks = fit_clocks(flight[rows])
         noise_dbm, noise_s = receive_noise(clocks.receive_noise_s, flight.exchanges.fpp2_dbm[rows])
@@ -315,7 +318,7 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
 
 
 def summary(flight: TwinFlight, fitted: FittedFlight) -> dict[str, Any]:
-    """Return what was fitted by name, numbers or None, and tables by tag and by pair."""
+    """Return the fitted values by name (numbers or None), and tables by tag and by pair."""
     clocks, errors, powers, schedule = fitted.clocks, fitted.errors, fitted.powers, fitted.schedule
     noise = fitted.noise_s
     return {
@@ -368,6 +371,6 @@ def summary(flight: TwinFlight, fitted: FittedFlight) -> dict[str, Any]:
 
 
 def check_name(path: Path) -> None:
-    """Raise `ScenarioError` for an output that is no scenario file."""
+    """Raise `ScenarioError` if an output has not the suffix of a scenario file."""
     if path.suffix.lower() != ".toml":
         raise ScenarioError(f"{path}: found {path.suffix or 'no suffix'}, expected the name of a scenario file (.toml)")

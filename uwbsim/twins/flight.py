@@ -1,7 +1,7 @@
-"""The columns of a recording to which a twin is fitted and compared, their statistics, and the schedule.
+"""The data of a recording to which a twin is fitted, their statistics, and the schedule of its exchanges.
 
-Lives of reflections and fading are time constants of autocovariances within pairs, without a model of their causes.
-The schedule is who ranged when, how soon boards replied, and which exchanges were lost.
+Durations of reflections and fading are time constants of autocovariances within pairs, without a model of their causes.
+The schedule contains the times and pairs of exchanges, reply times, and lost exchanges.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def lasting(time_s: Floats, pair: Ints, value: Floats) -> tuple[float, float | N
     """Return variance and time constant in seconds of the persistent part of values (n,), about the means of pairs.
 
     An exponential is fitted to the autocovariance over all pairs. Subtracting means over a flight of finite length
-    lowers the autocovariance at every lag, which the fit takes into account. The time constant is None, and the
-    variance 0, where the lags do not determine them.
+    lowers the autocovariance at all lags; the fit includes this effect. If the data do not determine the time constant,
+    it is None and the variance is 0.
     """
     centred = value - (np.bincount(pair, value) / np.maximum(np.bincount(pair), 1))[pair]
     variance, span_s = float(np.mean(centred**2)), float(time_s[-1] - time_s[0])
@@ -43,28 +43,30 @@ def lasting(time_s: Floats, pair: Ints, value: Floats) -> tuple[float, float | N
     if len(lag_s) < 3 or variance <= 0:
         return 0.0, None
     error = variance / np.sqrt(count)
-    # Time constants in steps of 2 to 3 %; each has its likeliest variance.
+    # A grid of time constants; each has its variance by weighted least squares.
     life = np.geomspace(lag_s[0] / 20, span_s / 2, 400)[:, None]
-    # The share of a variance that the mean over a span has, where the autocovariance is exponential.
+    # Variance of the mean over the span T of a process with the autocovariance exp(-lag / life): with r = life / T,
+    # 2 r (1 - r (1 - exp(-1 / r))).
     ratio = life / span_s
-    taken = 2 * ratio * (1 - ratio * (1 - np.exp(-1 / ratio)))
-    shape, asked = (np.exp(-lag_s / life) - taken) / error, covariance / error
-    found = np.maximum(shape @ asked / np.sum(shape**2, axis=1), 0.0)
-    best = int(np.argmin(np.sum((found[:, None] * shape - asked) ** 2, axis=1)))
-    unclear = np.max(asked) < 4 or life[best] < lag_s[0] / 3 or found[best] > 1.5 * variance  # 4 standard errors
+    of_mean = 2 * ratio * (1 - ratio * (1 - np.exp(-1 / ratio)))
+    shape, scaled = (np.exp(-lag_s / life) - of_mean) / error, covariance / error
+    found = np.maximum(shape @ scaled / np.sum(shape**2, axis=1), 0.0)
+    best = int(np.argmin(np.sum((found[:, None] * shape - scaled) ** 2, axis=1)))
+    # Undetermined: no lag with four standard errors, a time constant below the lags, or a variance above the measured.
+    unclear = np.max(scaled) < 4 or life[best] < lag_s[0] / 3 or found[best] > 1.5 * variance
     return (0.0, None) if unclear else (float(found[best]), float(life[best, 0]))
 
 
 def _autocovariance(time_s: Floats, pair: Ints, centred: Floats, span_s: float) -> tuple[Floats, Floats, Floats]:
-    """Return mean products of values of a pair that lie some time apart: lags in seconds, covariances, counts.
+    """Return the autocovariance of values within pairs, in bins of the lag: lags in seconds, covariances, counts.
 
-    Lags reach a quarter of the span: longer ones have few independent products.
+    Lags are at most a quarter of the span, because longer lags have few independent products.
     """
     order = np.lexsort((time_s, pair))
     time, values, group = time_s[order], centred[order], pair[order]
     longest = int(np.bincount(pair).max()) // 4
     lags, products = [np.zeros(0)], [np.zeros(0)]
-    # Products lie 1, 2, ... values of the pair apart, denser where they are few.
+    # Distances in numbers of values of a pair, in geometric steps from 1.
     for step in np.unique(np.geomspace(1, max(longest, 2), 40).astype(np.int64)).tolist():
         apart = time[step:] - time[:-step]
         near = (group[step:] == group[:-step]) & (apart >= 1e-3) & (apart <= span_s / 4)
@@ -81,10 +83,11 @@ def _autocovariance(time_s: Floats, pair: Ints, centred: Floats, span_s: float) 
 
 
 def effective_size(value: Floats, group: Ints) -> float:
-    """Return the effective number of independent values among n values, in order of time within groups.
+    """Return the effective number of independent values among values (n,), in order of time within groups (n,).
 
-    n / (1 + 2 sum of autocorrelations), about the mean of all so that groups which differ count as less; the sum ends
-    before the first pair of lags whose sum is not positive (Geyer, Statistical Science 7, 1992).
+    It is n / (1 + 2 sum of autocorrelations), about the mean of all values, so that differences between groups reduce
+    it. The sum ends before the first pair of successive lags whose sum is not positive (Geyer, Statistical Science 7,
+    1992).
     """
     count, centred = len(value), value - value.mean()
     variance = float(np.mean(centred**2))
@@ -105,22 +108,25 @@ def effective_size(value: Floats, group: Ints) -> float:
 
 
 def some_rows(count: int, most: int) -> Ints:
-    """Return `most` of `count` rows, chosen at random, in order: every k-th would leave out pairs that take turns."""
+    """Return at most `most` of `count` rows, a random choice in ascending order.
+
+    Every k-th row could leave out pairs that range in turns.
+    """
     chosen = range(count) if count <= most else stream(0, "some rows", count).choice(count, most, replace=False)
     return np.sort(chosen)
 
 
 def bulk_spread(value: Floats) -> float:
-    """Return half the distance of the quantiles at 16 and 84 %: a standard deviation robust to outliers."""
+    """Return half of the difference of the 84 % and 16 % quantiles, a standard deviation robust to outliers."""
     low, high = np.quantile(value, [0.16, 0.84])
     return float(high - low) / 2
 
 
 def lag_one(value: Floats, group: Ints) -> tuple[float, float]:
-    """Return the autocorrelation r of values (n,) to the next of their group, about the mean of all, and its error.
+    """Return the autocorrelation r of successive values (n,) within groups, about the mean of all, and its std. error.
 
-    The standard error is that of the mean of x_k x_{k+1} - r x_k^2 over the variance, whose terms persist, too. NaN
-    where fewer than eight values have a next one.
+    The standard error is that of the mean of (x_k x_{k+1} - r x_k^2) / variance, with the effective number of these
+    terms. Both are NaN with fewer than eight pairs of successive values.
     """
     order = np.argsort(group, kind="stable")
     centred, sorted_group = (value - value.mean())[order], group[order]
@@ -139,24 +145,28 @@ RecordingSource = str | os.PathLike[str] | Contents
 
 
 def read_flight(source: RecordingSource) -> tuple[Contents, str]:
-    """Return the contents of a recording and its name in messages; raises what `Recording.open` raises."""
+    """Return the contents of a recording, and its name for messages.
+
+    Raises the errors of `Recording.open`, and `ScenarioError` for an object that is not the contents of a recording.
+    """
     if not isinstance(source, str | os.PathLike):
         if not all(hasattr(source, name) for name in ("exchanges", "tags", "poses", "faults")):
             raise ScenarioError(f"recording: found {source!r:.60}, expected a file (.uwb) or its contents")
         return source, "recording"
     with Recording.open(Path(source)) as file:
-        held = Contents(exchanges=file.exchanges(), tags=file.tags(), poses=file.poses(), faults=file.faults())
-        return held, str(source)
+        contents = Contents(exchanges=file.exchanges(), tags=file.tags(), poses=file.poses(), faults=file.faults())
+        return contents, str(source)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TwinFlight:
-    """Exchanges of one protocol between tags whose places are known, as columns of length n in order of time.
+    """Exchanges of one protocol between tags with known positions, as columns of length n in order of time.
 
-    `time_s` counts from `origin_ns`; `ends` are places in `tags` of initiator and target, (2, n), `pair` the places of
-    both in `pairs`, whichever began; `towards` are unit vectors to the other end in the frames of the two bodies,
-    (2, n, 3). `residual_m` is calibrated range less distance; `ratio_ppm` by how much the initiator's clock is faster
-    than the target's as dt64/dt53 says, NaN where the protocol has no third message. `where` is the recording's file.
+    `time_s` counts from `origin_ns`; `ends` (2, n) are the indices in `tags` of initiator and target, `pair` (n,) is
+    the index in `pairs`, for both directions; `towards` (2, n, 3) are unit vectors to the other end in the frames of
+    the two bodies. `residual_m` is the calibrated range minus the distance; `ratio_ppm` the rate of the initiator's
+    clock relative to the target's by dt64/dt53, NaN unless the target sends a third message. `where` is the file of the
+    recording.
     """
 
     where: str
@@ -178,7 +188,7 @@ class TwinFlight:
         return len(self.time_s)
 
     def __getitem__(self, rows: Ints) -> Self:
-        """Return the chosen exchanges, in their order; times go on counting from the same instant."""
+        """Return the chosen exchanges, in their order; `origin_ns` does not change."""
         return replace(
             self,
             exchanges=self.exchanges[rows],
@@ -192,9 +202,9 @@ class TwinFlight:
         )
 
     def some(self, most: int) -> Ints:
-        """Return the rows of at most `most` exchanges, in blocks that are spread evenly over the flight.
+        """Return the rows of at most `most` exchanges, in blocks that are evenly spread over the flight.
 
-        Within a block exchanges are consecutive, so that short lags are kept.
+        Exchanges within a block are consecutive, so that autocovariances at short lags do not change.
         """
         if len(self) <= most:
             return np.arange(len(self))
@@ -204,21 +214,22 @@ class TwinFlight:
 
     @property
     def interval_s(self) -> float:
-        """Return the median interval between the exchanges of a pair, in seconds."""
+        """The median interval between exchanges of a pair, in seconds."""
         order = np.lexsort((self.time_s, self.pair))
         apart = np.diff(self.time_s[order])[np.diff(self.pair[order]) == 0]
         return float(np.median(apart)) if len(apart) else float("inf")
 
     @property
     def power_dbm(self) -> Floats:
-        """First-path powers read at target and initiator, (2, n)."""
+        """First-path powers (2, n) in dBm, at the target and at the initiator."""
         return np.array([self.exchanges.fpp1_dbm, self.exchanges.fpp2_dbm])
 
     @classmethod
     def of(cls, flown: Contents, known: KnownDevices, where: str = "recording", *, fewest: int = 100) -> Self:
-        """Return the columns of a recording; raises `ScenarioError` where no twin can be fitted.
+        """Return the data of a recording, with ranges calibrated by `known`.
 
-        That is with less than `fewest` exchanges: of 100, the quantiles of residuals are wrong by a tenth of their
+        Raises `TooFewDataError` if poses, powers, tags or the delays of tags are missing, for long replies, and for
+        fewer than `fewest` exchanges: with 100, the standard error of quantiles of residuals is a tenth of their
         spread.
         """
 
@@ -256,7 +267,7 @@ class TwinFlight:
             f"{fewest} or more; record longer, with motion capture all the time",
         )
         x, distance = x[good], distance[good]
-        # In order of their numbers, so that places in it can be searched.
+        # Sorted by id, for `searchsorted`.
         tags = tuple(sorted((tag for tag in flown.tags if tag.tag in ids), key=lambda tag: tag.tag))
         ends = np.searchsorted([tag.tag for tag in tags], [x.initiator, x.target])
         pairs, pair = np.unique(np.sort(ends, axis=0), axis=1, return_inverse=True)
@@ -278,7 +289,7 @@ class TwinFlight:
 
 
 def attitude(poses: Poses, body: str, time_ns: Ints) -> Rotation:
-    """Return the attitudes of a body at times (n,), held beyond its poses."""
+    """Return the attitudes of a body at times (n,), interpolated between its poses and constant outside them."""
     mine = np.flatnonzero(poses.body == body)
     times, first = np.unique(poses.time_ns[mine], return_index=True)
     turns = Rotation.from_quat(poses.quaternion[mine][first])
@@ -297,16 +308,17 @@ def _ratio_ppm(exchanges: Exchanges, row: RangingProtocol) -> Floats:
 
 
 SHORTEST_LIFE_S: Final = 0.01
-"""The shortest `life_s` of paths, fading and outages in a scenario."""
+"""Smallest `life_s` of paths, fading and outages in a scenario."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScheduleFit:
-    """When exchanges began, of whom, and which were lost: columns (slots,) in order of time, `ends` (2, slots).
+    """The schedule of exchanges, including lost ones: start times (slots,), and initiators and targets (2, slots).
 
-    `rate_hz` counts all; `turns` is the order of a round robin, None where exchanges went by another plan. Outages of a
-    pair last `outage_life_s`. `delay_uus` is the scheduled delay, `replies_us` quantiles of replies at once; None where
-    the protocol has none.
+    `rate_hz` is the rate of all exchanges. `turns` (2, pairs) is the order of a round robin, None if exchanges had
+    another order. `lost_share` is the share of lost exchanges; outages of a pair last `outage_life_s`. `delay_uus` is
+    the delay of scheduled messages, `replies_us` are quantiles of the times of immediate replies; None if the protocol
+    has no such message.
     """
 
     time_s: Floats
@@ -320,7 +332,7 @@ class ScheduleFit:
 
 
 def fit_schedule(flight: TwinFlight, faults: list[Fault]) -> ScheduleFit:
-    """Return the schedule of a flight, with the exchanges that failed meanwhile."""
+    """Return the schedule of a flight, including failed exchanges (`faults`)."""
     place: dict[int | None, int] = {tag.tag: k for k, tag in enumerate(flight.tags)}
     known = [fault for fault in faults if fault.initiator in place and fault.target in place]
     times = np.array([fault.time_ns for fault in known], dtype=np.int64)
@@ -334,12 +346,13 @@ def fit_schedule(flight: TwinFlight, faults: list[Fault]) -> ScheduleFit:
     round_robin = _round_robin(time, ends)
     if round_robin:
         beat, slot, turns = round_robin
-        # Slots that left nothing at all are lost, too.
+        # Slots without an exchange and without a fault are lost, too.
         every = np.arange(slot[-1] + 1)
         rate, time, ends = 1 / beat, every * beat, turns[:, every % turns.shape[1]]
         lost = ~np.isin(every, slot[~lost])
     elif _logged_late(flight):
-        # What was received had the air to itself, however late and in what groups it was logged.
+        # Logged times are late and in groups, but exchanges did not overlap in the air: move them apart by the duration
+        # of an exchange.
         own = intervals(flight.exchanges)
         ticks = own.dt41 + (own.dt64 if len(flight.row.messages) > 2 else 0.0)
         lasts_s = min(float(np.quantile(ticks, 0.99)) * TICK_S + frame_s(FINAL_BYTES, 128) + TURNAROUND_S, 1 / rate)
@@ -359,7 +372,7 @@ def fit_schedule(flight: TwinFlight, faults: list[Fault]) -> ScheduleFit:
 
 
 def _logged_late(flight: TwinFlight) -> bool:
-    """Return whether times are a log's: an initiator's stamps say that its exchanges began at others, by 0.1 ms."""
+    """Return whether times are those of a log: they differ by 0.1 ms or more from the stamps of initiators."""
     order, wrap_s = np.lexsort((flight.time_s, flight.ends[0])), TICK_S * 2.0**flight.exchanges.bits
     apart_s = np.diff(flight.time_s[order]) - np.diff(flight.exchanges.tx1[order] * TICK_S)
     late_s = (apart_s - wrap_s * np.rint(apart_s / wrap_s))[np.diff(flight.ends[0, order]) == 0]
@@ -367,7 +380,7 @@ def _logged_late(flight: TwinFlight) -> bool:
 
 
 def _round_robin(time: Floats, ends: Ints) -> tuple[float, Ints, Ints] | None:
-    """Return interval, slots (n,) and turns (2, pairs) of a round robin that nine of ten exchanges keep to, or None."""
+    """Return interval, slots (n,) and turns (2, pairs) of a round robin; None if it explains less than 90 %."""
     turns, pair = np.unique(ends, axis=1, return_inverse=True)
     count, apart = turns.shape[1], np.diff(time)
     usual = np.median(apart) if len(apart) else 0.0
@@ -383,17 +396,17 @@ def _round_robin(time: Floats, ends: Ints) -> tuple[float, Ints, Ints] | None:
 
 
 def _scheduled_uus(flight: TwinFlight) -> int | None:
-    """Return the delay of the first scheduled message, within what a scenario takes."""
+    """Return the delay of the first scheduled message, within the bounds of a scenario; None without one."""
     spans = intervals(flight.exchanges)
     for message, ticks in zip(flight.row.messages[1:], (spans.dt32, spans.dt53), strict=False):
         if message.timing == "scheduled":
-            # A delay is cut to the grid of transmissions, after which the antenna's comes on top.
+            # The chip rounds a scheduled time down to its grid, and adds the antenna delay.
             return int(np.clip(round((np.median(ticks) - ANTENNA_DELAY_TICKS) / UUS_TICKS), 280, 6500))
     return None
 
 
 def _replies_us(flight: TwinFlight) -> tuple[float, ...] | None:
-    """Return quantiles of replies at once, within what a scenario takes."""
+    """Return quantiles of immediate reply times, within the bounds of a scenario; None for scheduled replies."""
     if flight.row.messages[1].timing != "at once":
         return None
     delays = intervals(flight.exchanges).dt32 * TICK_S * 1e6

@@ -1,4 +1,4 @@
-"""Path loss, antennas, offsets of tags, fading and noise of readings, from first-path powers over distance."""
+"""Path loss, antennas, power offsets of tags, fading and noise of readings, fitted to first-path powers."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ from uwbsim.twins.flight import TwinFlight, bulk_spread, effective_size, lasting
 from uwbsim.world.radio import ANTENNAS, before_saturation_dbm, harmonics
 
 MIN_REFLECTED: Final = 5.0
-"""Reflected exchanges, by their probabilities, below which their losses are not determined: a spread of
-five is known to a third (the root of 1/8)."""
+"""Smallest number of reflected exchanges (sum of their probabilities) from which the loss of reflections is fitted. The
+spread of five values is known to a third (the root of 1/8)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PowerFit:
-    """The model of first-path powers: levels in dBm and dB.
+    """The model of first-path powers, in dBm and dB.
 
-    `saturation_dbm` is where readings end, None where nothing shows that they do. `exponent` is None where distances
-    do not differ enough. `tx_db`, `offset_db` (tags,) and `pattern_db` (tags, harmonics) are of tags, by place.
-    `reflection_loss_db` with `reflection_loss_std_db` about it is what a reflection takes off, None where there are too
-    few. `fading_db` is how much fading both ends share, `fading_levels_db` its quantiles; it lasts `fading_life_s`,
-    None where the recording does not tell; `noise_db` is of a reading.
+    `saturation_dbm` is the upper limit of readings, None without significant saturation. `at_1m_dbm` and `exponent`
+    describe the path loss; `exponent` is None if distances are too similar. `tx_db` and `offset_db` (tags,) are the
+    offsets of transmitters and receivers, `pattern_db` (tags, harmonics) the antenna patterns. Reflections reduce the
+    power by `reflection_loss_db` with the standard deviation `reflection_loss_std_db`; None with too few reflections.
+    `fading_db` is the standard deviation of the fading that both ends have in common, `fading_levels_db` are its
+    quantiles, and `fading_life_s` is its time constant, None if undetermined; `noise_db` is the noise of a reading.
     """
 
     saturation_dbm: float | None
@@ -56,36 +57,38 @@ class _Solved:
 
 
 def fit_powers(flight: TwinFlight, reflected: Floats) -> PowerFit:
-    """Fit powers of a flight whose ranges are reflected with known probabilities (n,)."""
+    """Fit the powers of a flight, given the probabilities of reflections (n,)."""
     enough = float(reflected.sum()) >= MIN_REFLECTED
     saturation, power = _unsaturated(flight, reflected)
     plain, *shaped = [_solve(flight, power, reflected, antenna, rounds=1) for antenna in ANTENNAS]
     best = min(shaped, key=lambda one: float(np.var(one.left_db)))
-    # An antenna with a shape is taken where it leaves 3 % less than none.
+    # Use an antenna model only if it reduces the residual variance by more than 3 % (a judgement).
     if np.var(best.left_db) >= 0.97 * np.var(plain.left_db):
         best = plain
-    # A reading has the variance that is left, as much larger as values that last are worth less than their number.
+    # The variance of a reading is the residual variance, increased because persistent fading reduces the effective
+    # number of readings.
     both = best.left_db.mean(axis=0)
     scale_db2 = float(np.var(best.left_db) * 2 * len(both) / effective_size(both, flight.pair))
     solved = _solve(flight, power, reflected, best.antenna, rounds=5, scale_db2=scale_db2)
     if solved.loss_db < 0:
-        # Reflections are not stronger than what they replace; what looks like that is something else.
+        # Reflections cannot increase power, so a negative loss has another cause: fit without reflections.
         reflected = np.zeros(len(flight))
         solved = _solve(flight, power, reflected, best.antenna, rounds=5, scale_db2=scale_db2)
     elif enough and solved.loss_db > 0:
-        # Detours shorter than the noise of ranges show in powers.
+        # Powers indicate reflections whose detours are shorter than the noise of ranges.
         reflected = _by_power(solved, reflected)
         solved = _solve(flight, power, reflected, best.antenna, rounds=5, scale_db2=scale_db2)
-    # The pattern of a tag that ranges in one direction only may contain its offsets: there both are added.
+    # If a tag ranges in few directions, its pattern contains a part of its offsets: add the mean gain to the offsets,
+    # and subtract it from the pattern's constant.
     seen = _mean_gains(flight, solved.pattern_db)
-    level, own, tx, offset = _split(*(solved.tags_db + seen))
-    fading, loss_std = _common(solved, reflected)
+    level, own, tx, offset = _split_offsets(*(solved.tags_db + seen))
+    fading, loss_std = _common_spreads(solved, reflected)
     both = solved.left_db.mean(axis=0)
     _, life = lasting(flight.time_s, flight.pair, both) if fading > 0 else (0.0, None)
     return PowerFit(
         saturation_dbm=saturation,
         at_1m_dbm=solved.at_1m_dbm + level,
-        exponent=solved.exponent if _tells_path_loss(flight) else None,
+        exponent=solved.exponent if _determines_path_loss(flight) else None,
         antenna=solved.antenna,
         tx_db=tx,
         offset_db=offset,
@@ -99,16 +102,17 @@ def fit_powers(flight: TwinFlight, reflected: Floats) -> PowerFit:
     )
 
 
-def _tells_path_loss(flight: TwinFlight) -> bool:
-    """Return whether distances differ by more than some 12 %."""
+def _determines_path_loss(flight: TwinFlight) -> bool:
+    """Return whether the standard deviation of the logarithm of distances is at least 12 % (a judgement)."""
     return bool(np.std(np.log10(flight.distance_m)) >= 0.05)
 
 
 def _unsaturated(flight: TwinFlight, reflected: Floats) -> tuple[float | None, Floats]:
-    """Return where readings of power end, and the powers (2, n) without this saturation.
+    """Return the saturation level of power readings in dBm, None without any, and the powers (2, n) without saturation.
 
-    They end where they would without saturation exceed their maximum so often that chance leaves none there with a
-    probability of 1 %. Where they end is the likeliest of some levels above the maximum.
+    Without saturation, the number of readings above their maximum would have an expectation e by the model. There is
+    saturation if exp(-e), the probability of none, is at most 1 %. The level is the most likely one of some levels
+    above the maximum.
     """
     direct = np.flatnonzero(reflected < 0.5)
     some = flight[direct[some_rows(len(direct), 4000)]]
@@ -131,24 +135,24 @@ def _unsaturated(flight: TwinFlight, reflected: Floats) -> tuple[float | None, F
 def _solve(
     flight: TwinFlight, power_dbm: Floats, reflected: Floats, antenna: str, *, rounds: int, scale_db2: float = 100.0
 ) -> _Solved:
-    """Solve one penalized least-squares problem: two readings an exchange, weighed anew in each of the rounds.
+    """Solve a penalised least-squares problem with two readings per exchange, and new weights in each of the rounds.
 
-    `scale_db2` is the variance in dB^2 of a reading about the gain of an antenna. The priors have a mean of zero and
-    standard deviations of 4 dB for offsets of tags, 2/k dB for harmonics of degree k of an antenna. The highest degree
-    is the one that the readings of a tag determine.
+    `scale_db2` is the variance of a reading in dB^2. The priors have the mean zero and standard deviations of 4 dB for
+    offsets of tags and of 2/k dB for harmonics of degree k of an antenna (judgements). The highest degree depends on
+    the number of readings per tag.
     """
     tags, each = len(flight.tags), 4 * len(flight) / len(flight.tags)
     degree = next((degree for least, degree in ((800, 3), (250, 2), (80, 1)) if each >= least), 0)
-    size = (degree + 1) ** 2 - 1  # all of a tag's readings know of its mean, which the offsets have
+    size = (degree + 1) ** 2 - 1  # without degree 0, which has the same effect as the offsets
     gain = sum(ANTENNAS[antenna](np.hypot(way[:, 0], way[:, 1])) for way in flight.towards)
     first, second = is_tag = np.eye(tags)[flight.ends]
     waves = np.array([harmonics(way, degree)[:, 1:] for way in flight.towards])
     pattern = np.einsum("ent,enk->ntk", is_tag, waves).reshape(len(flight), -1)
     common = np.column_stack([np.ones(len(flight)), -10 * np.log10(flight.distance_m), -reflected])
-    # Readings at the target, then at the initiator: what they have in common, sender, receiver, both antennas.
+    # Rows: readings at the target, then at the initiator. Columns: common effects, transmitters, receivers, antennas.
     design = np.block([[common, first, second, pattern], [common, second, first, pattern]])
     value = (power_dbm - gain).ravel()
-    exponent = 0.0 if _tells_path_loss(flight) else 1e9
+    exponent = 0.0 if _determines_path_loss(flight) else 1e9
     fine = [scale_db2 * (k / 2.0) ** 2 for k in range(1, degree + 1) for _ in range(2 * k + 1)]
     penalty = np.array([0.0, exponent, 1e-6] + [scale_db2 / 4.0**2] * (2 * tags) + fine * tags)
     prior, weight = np.zeros(design.shape[1]), np.ones(len(value))
@@ -158,7 +162,7 @@ def _solve(
         normal = weighted @ design + np.diag(penalty) + 1e-9 * np.eye(len(penalty))
         found = prior + np.linalg.solve(normal, weighted @ (value - design @ prior))
         left = value - design @ found
-        # Huber's weights: fades are deep more often than normal.
+        # Weights of Huber's loss, because deep fades are more frequent than in a normal distribution.
         weight = 1 / np.maximum(np.abs(left) / (1.5 * max(bulk_spread(left), 1e-6)), 1.0)
     return _Solved(
         antenna=antenna,
@@ -172,14 +176,14 @@ def _solve(
 
 
 def _by_power(solved: _Solved, reflected: Floats) -> Floats:
-    """Return the probabilities (n,) that ranges were reflected, by their powers, too, which reflections lower."""
+    """Return the probabilities (n,) of reflections, updated by the likelihoods of the mean powers of exchanges."""
     above = solved.left_db.mean(axis=0) - reflected * solved.loss_db
     spread = max(bulk_spread(above[reflected < 0.5]), 0.1)
     return np.asarray(expit(logit(reflected) + (above**2 - (above + solved.loss_db) ** 2) / (2 * spread**2)))
 
 
 def _mean_gains(flight: TwinFlight, pattern_db: Floats) -> Floats:
-    """Return the mean gain of each tag's pattern towards those that it ranged with, (tags,)."""
+    """Return the mean gain of each tag's pattern (tags,) in dB, over the directions of its exchanges."""
     degree = isqrt(pattern_db.shape[1] + 1) - 1
     gains = [
         np.einsum("nk,nk->n", harmonics(way, degree)[:, 1:], pattern_db[end])
@@ -190,12 +194,12 @@ def _mean_gains(flight: TwinFlight, pattern_db: Floats) -> Floats:
     return np.asarray(total / np.maximum(np.bincount(ends, minlength=count), 1))
 
 
-def _split(sends_db: Floats, reads_db: Floats) -> tuple[float, Floats, Floats, Floats]:
-    """Split what tags send and read too strong into the level of all, antenna, transmitter and receiver, (tags,) each.
+def _split_offsets(sends_db: Floats, reads_db: Floats) -> tuple[float, Floats, Floats, Floats]:
+    """Split offsets of sent and of received powers (tags,) into a common level, antenna, transmitter and receiver.
 
-    The difference of the two directions is known but for a constant, which is chosen so that the median tag has no
-    difference. It is assigned to the transmitter or to the receiver, whichever leaves less to the antenna. The antenna
-    has what both directions have in common.
+    The last three have shape (tags,). The differences of both offsets are known except for a constant, which is chosen
+    so that the median difference is zero. A difference is assigned to the transmitter or to the receiver, whichever
+    leaves less to the antenna. The rest of the mean of both offsets is assigned to the antenna.
     """
     between, common = sends_db - reads_db, (sends_db + reads_db) / 2
     level = float(np.median(common))
@@ -206,17 +210,20 @@ def _split(sends_db: Floats, reads_db: Floats) -> tuple[float, Floats, Floats, F
 
 
 def _levels(both_db: Floats, reflected: Floats, fading_db: float) -> Floats:
-    """Return quantiles of fading, from what both ends have in common and noise that is taken out of its spread."""
+    """Return quantiles of fading, from mean residuals of both ends (n,), scaled to the spread without noise."""
     direct = both_db[reflected < 0.5]
-    levels = 41  # and as many readings at least
+    levels = 41  # also the smallest number of direct readings that are used alone
     direct = direct if len(direct) >= levels else both_db
     found = np.quantile(direct, np.linspace(0, 1, levels))
     middle = float(np.median(direct))
     return np.asarray(middle + (found - middle) * min(fading_db / max(float(np.std(direct)), 1e-9), 1.0))
 
 
-def _common(solved: _Solved, reflected: Floats) -> tuple[float, float]:
-    """Return how much fading both ends have in common, and by how much losses of reflections differ, in dB."""
+def _common_spreads(solved: _Solved, reflected: Floats) -> tuple[float, float]:
+    """Return the standard deviations of the fading that both ends share, and of the loss of reflections, in dB.
+
+    Both follow from the mean product of the residuals of both ends, which excludes the noise of readings.
+    """
     first, second = solved.left_db
     unsure = reflected * (1 - reflected) * solved.loss_db**2
     design = np.column_stack([np.ones(len(reflected)), reflected])

@@ -1,7 +1,7 @@
 """Calibrations for twins, and the error model of ranges that `calib.fit` fits to a flight.
 
-This is the one place where `uwbsim` imports `calib`. The error model is that of every fit: direct ranges with normal
-noise, reflections by pair, outliers. How long reflections last follows from autocovariances.
+This is the only module of `uwbsim` that imports `calib`. The error model is that of fits: direct ranges with normal
+noise, reflections by pair, outliers. Durations of reflections are estimated from autocovariances.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ CalibrationSource = str | os.PathLike[str] | Mapping[str, Any] | Any
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KnownDevices:
-    """A calibration, `where` it is from, and its bias curve over the scenario's lifted power."""
+    """A calibration, its source `where`, and its bias curve over the lifted power of scenarios."""
 
     where: str
     calibration: Calibration
@@ -56,7 +56,7 @@ class KnownDevices:
 
 
 def read_calibration(source: CalibrationSource) -> KnownDevices:
-    """Read a calibration; raises `ScenarioError`, one line that names file and key."""
+    """Read a calibration; raises `ScenarioError` that names file and key."""
     from calib import CalibError, Calibration, load_calibration
 
     where = str(source) if isinstance(source, str | os.PathLike) else "calibration"
@@ -71,7 +71,7 @@ def read_calibration(source: CalibrationSource) -> KnownDevices:
     ):
         if getattr(found, key):
             raise ScenarioError(f"{where}: {key}: {text}")
-    # A scenario lifts powers about -82 dBm: 10^((p - alpha)/10) of the calibration differs by a factor.
+    # Scenarios lift powers with alpha = -82 dBm. With another alpha, 10^((p - alpha)/10) differs by this factor.
     scale, curve = 10 ** ((found.alpha_dbm + 82.0) / 10), found.bias_curve
     knots = tuple(knot * scale for knot in curve.knots)
     table = {"knots": knots, "coefficients": curve.coefficients, "degree": curve.degree}
@@ -81,14 +81,14 @@ def read_calibration(source: CalibrationSource) -> KnownDevices:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FittedRangeErrors:
-    """The errors of calibrated ranges: all lengths in metres.
+    """The errors of calibrated ranges; lengths are in metres.
 
-    `delays_ns` is what the flight adds to the delays of tags, by id. `direct_std_m` is the spread of direct ranges
-    beyond the noise of receive stamps; `share` that of reflected ranges; `mean_excess_m` the mean of their detours and
-    `excess_shape` the shape of a gamma distribution with their mean and variance. `pair_share`, `pair_excess_m` and
-    `pair_life_s` are those of pairs (pairs,), shrunk towards the mean of all pairs the more the less each determines.
-    `life_s` is None, and those of pairs NaN, where the recording does not determine it. `reflected` (n,) is the
-    probability that a range was reflected.
+    `delays_ns` are changes of the calibration's delays by tag that fit the flight. `direct_std_m` is the standard
+    deviation of direct ranges in addition to the noise of receive stamps; `share` is the share of reflected ranges,
+    `mean_excess_m` their mean detour, and `excess_shape` the shape of a gamma distribution with the mean and variance
+    of the detours. `life_s` is the duration of reflections. `pair_share`, `pair_excess_m` and `pair_life_s` are those
+    of pairs (pairs,), shrunk towards the values of all pairs. If the recording does not determine durations, `life_s`
+    is None and `pair_life_s` NaN. `reflected` (n,) are the probabilities of a reflection.
     """
 
     delays_ns: dict[int, float]
@@ -104,10 +104,10 @@ class FittedRangeErrors:
 
 
 def fit_range_errors(flight: TwinFlight, receive_noise_s: Floats) -> FittedRangeErrors:
-    """Fit a flight whose receive stamps have noises (n,) in seconds, zero where none is known.
+    """Fit the errors of ranges, given the noise of receive stamps (n,) in seconds, zero if unknown.
 
-    Powers are withheld from the fit: reflections are weaker than direct paths, so a second bias curve beside that of
-    the calibration would follow them. Raises `TooFewDataError` where `calib.fit` cannot answer.
+    The fit uses equal powers: reflections are weaker than direct paths, so a second bias curve, in addition to that of
+    the calibration, would follow reflections. Raises `TooFewDataError` if `calib.fit` raises an error.
     """
     from calib import CalibError, Ranges, fit
 
@@ -122,7 +122,7 @@ def fit_range_errors(flight: TwinFlight, receive_noise_s: Floats) -> FittedRange
         source=flight.where,
     )
     with restating(TooFewDataError, CalibError):
-        # The twin has the errors of this recording: what pairs differ by between recordings is left out.
+        # The twin has the errors of this recording, so errors that differ between recordings are left out.
         found = fit(ranges, between_m=0.0).calibration
     if found.errors is None:
         raise TooFewDataError(f"{flight.where}: the errors of its ranges are all equal")
@@ -131,7 +131,7 @@ def fit_range_errors(flight: TwinFlight, receive_noise_s: Floats) -> FittedRange
     excess, reflected = found.errors.least_m + shapes.detour_m, applied.tail_probability
     mean, shape, share = TwoStateMultipath(model="two-state").mean_excess_m, 1.0, np.zeros(count)
     pair_excess, life, pair_life = np.full(count, mean), None, np.full(count, np.nan)
-    # Fewer than five ranges that are rather reflected than direct are no tail.
+    # With fewer than five ranges that are more likely reflected than direct, assume no reflections (a judgement).
     if np.count_nonzero(reflected > 0.5) < 5:
         reflected = np.zeros(len(x))
     else:
@@ -144,7 +144,7 @@ def fit_range_errors(flight: TwinFlight, receive_noise_s: Floats) -> FittedRange
         if life is not None:
             pair_life = _lives(flight, reflected, life, share)
     white = range_noise_m(flight, receive_noise_s)
-    # Ranges of two messages err by the skew of the clocks, which the fit takes for delays and the twin simulates.
+    # Skew causes errors of ranges with two messages that look like delays. The twin simulates skew, so leave them out.
     from_delays = len(flight.row.messages) > 2
     return FittedRangeErrors(
         delays_ns={tag: delay if from_delays else 0.0 for tag, delay in found.delays_ns.items()},
@@ -161,22 +161,26 @@ def fit_range_errors(flight: TwinFlight, receive_noise_s: Floats) -> FittedRange
 
 
 def _lives(flight: TwinFlight, reflected: Floats, life_s: float, share: Floats) -> Floats:
-    """Return the lives of pairs (pairs,), shrunk towards the life of all.
+    """Return the durations of reflections of pairs (pairs,) in seconds, shrunk towards that of all pairs.
 
-    The logarithm of a life has the variance 2/spells; the variance between pairs is what is observed beyond it.
+    The logarithm of an estimated duration has the variance 2 / spells. The variance between pairs is the variance of
+    the estimates minus the mean of that.
     """
     spells = np.maximum(2 * share * (1 - share) * flight.time_s[-1] / life_s, 1e-9)
-    off, told = np.zeros(len(share)), np.flatnonzero(spells >= 6)
-    for k in told:
+    off, estimated = np.zeros(len(share)), np.flatnonzero(spells >= 6)
+    for k in estimated:
         rows = np.flatnonzero(flight.pair == k)
         _, own = lasting(flight.time_s[rows], np.zeros(len(rows), dtype=np.int64), reflected[rows])
         off[k] = np.log((own or life_s) / life_s)
-    between = max(np.var(off[told]) - np.mean(2 / spells[told]), 0.0) if len(told) > 2 else 0.0
+    between = max(np.var(off[estimated]) - np.mean(2 / spells[estimated]), 0.0) if len(estimated) > 2 else 0.0
     return np.asarray(life_s * np.exp(off * between / (between + 2 / spells)))
 
 
 def range_noise_m(flight: TwinFlight, receive_noise_s: Floats) -> Floats:
-    """Return the spread of a range whose stamps have a noise in seconds: c s sqrt((1 + r + r^2)/2) (docs/theory.md)."""
+    """Return the standard deviation of ranges (n,) in metres by the noise s of receive stamps (n,) in seconds.
+
+    It is c s sqrt((1 + r + r^2) / 2) with r = dt32 / dt53, 0 for two messages (docs/theory.md).
+    """
     spans, ratio = intervals(flight.exchanges), np.zeros(len(flight))
     if len(flight.row.messages) > 2:
         ratio = spans.dt32 / np.maximum(spans.dt53, 1.0)

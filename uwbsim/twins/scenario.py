@@ -1,4 +1,4 @@
-"""The scenario of a twin: its tables from fitted values, their text, and what the recording does not determine."""
+"""The scenario of a twin: its tables, their text, and a list of properties that the recording does not determine."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from uwbsim.world.clocks import NS_PER_S
 from uwbsim.world.radio import lifted
 
 SCENARIO_COLUMNS: Final = 120
-"""Columns of a line of a scenario file."""
+"""Characters in a line of a scenario file."""
 
 AFTER_S: Final = 0.2
-"""Time that a scenario lasts beyond the start of its last exchange, which takes less."""
+"""Time from the start of the last exchange to the end of a scenario; exchanges take less."""
 
 
 def scenario_text(tables: Mapping[str, Any], head: str) -> str:
-    """Return the text of a scenario file: a comment, and tables within tables by their dotted names."""
+    """Return the text of a scenario file: a comment, and tables; inner tables have dotted names."""
     parts = ["\n".join(f"# {line}" for line in textwrap.wrap(head, SCENARIO_COLUMNS - 2))]
     for name, table in tables.items():
         rows = table if isinstance(table, list) else [table]
@@ -48,7 +48,7 @@ def _text(header: str, name: str, table: Mapping[str, Any]) -> str:
 
 
 def _toml(value: Any) -> str:
-    """Return a value as TOML: numbers with eight digits, tables in lists on lines of their own."""
+    """Return a value as TOML; numbers have eight digits, each table of a list has its own line."""
     if isinstance(value, float):
         return repr(float(f"{value:.8g}"))
     if isinstance(value, Mapping):
@@ -63,10 +63,10 @@ def _toml(value: Any) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FittedFlight:
-    """All that was fitted to a flight.
+    """All values fitted to a flight.
 
-    Receive stamps have the noise `noise_s` at the first-path powers `noise_dbm`: one value where it does not depend on
-    power, none where it is unknown.
+    `noise_s` is the noise of receive stamps at the first-path powers `noise_dbm`: one value if it does not depend on
+    power, none if it is unknown.
     """
 
     clocks: ClockFit
@@ -78,21 +78,22 @@ class FittedFlight:
 
 
 def receive_noise(noise_s: Floats, power_dbm: Floats) -> tuple[Floats, Floats]:
-    """Return powers in dBm, and the noise of receive stamps in seconds at these, as `FittedFlight` has them.
+    """Return powers in dBm, and the standard deviation of receive stamps at these powers, in seconds.
 
-    They follow from values of the noise (n,), NaN where unknown, and the powers at the receiver.
+    `noise_s` (n,) are errors of receive stamps, NaN if unknown, and `power_dbm` (n,) the powers of these receptions.
+    The result has the form of `FittedFlight`.
     """
     rows = np.flatnonzero(np.isfinite(noise_s))
     if not len(rows):
         return np.zeros(0), np.zeros(0)
     rows = rows[np.abs(noise_s[rows]) < 5 * bulk_spread(noise_s[rows])]
     rows = rows[np.argsort(power_dbm[rows], kind="stable")]
-    # Six bins at most, of 200 values or more each: their spreads are known to 5 %.
+    # At most six bins with at least 200 values each, whose standard deviations are known to 5 %.
     parts = np.array_split(rows, int(np.clip(len(rows) // 200, 1, 6)))
     std, together = (np.array([np.sqrt(np.mean(noise_s[own] ** 2)) for own in some]) for some in (parts, [rows]))
-    # The logarithm of a spread has the standard error 1/sqrt(2n).
-    misfit = np.sum([2 * len(own) for own in parts] * np.log(std / together) ** 2)
-    if chdtrc(len(parts) - 1, misfit) > 0.01:
+    # Chi-square test of equal standard deviations: the logarithm of each has the standard error 1/sqrt(2n).
+    chi_square = np.sum([2 * len(own) for own in parts] * np.log(std / together) ** 2)
+    if chdtrc(len(parts) - 1, chi_square) > 0.01:
         parts, std = [rows], together
     middle, first = np.unique([np.round(np.median(power_dbm[own]), 3) for own in parts], return_index=True)
     return middle, std[first]
@@ -101,7 +102,7 @@ def receive_noise(noise_s: Floats, power_dbm: Floats) -> tuple[Floats, Floats]:
 def tables(
     flight: TwinFlight, known: KnownDevices, poses: Poses, fitted: FittedFlight, name: str
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the scenario's tables, and the poses by body that its `recorded` motions stand for."""
+    """Return the tables of the scenario, and by body the poses of its `recorded` motions."""
     schedule = fitted.schedule
     whole = (len(schedule.time_s) + 0.3) / schedule.rate_hz
     duration = whole if schedule.turns is not None else float(schedule.time_s[-1]) + AFTER_S
@@ -120,7 +121,7 @@ def tables(
 
 
 def _given(**table: Any) -> dict[str, Any]:
-    """Return a table without the values that are None, which keep their defaults."""
+    """Return a table without the keys whose value is None; these have their defaults in the scenario."""
     return {key: value for key, value in table.items() if value is not None}
 
 
@@ -146,10 +147,10 @@ def _radio(flight: TwinFlight, known: KnownDevices, fitted: FittedFlight) -> dic
     sigma, fading, outages = None, None, None
     if len(noise_s) > 1:
         at = lifted(fitted.noise_dbm)
-        # A range whose reply takes no time has c s / sqrt(2).
+        # The key `sigma` is the standard deviation of a range without reply time, c s / sqrt(2).
         spread = SPEED_OF_LIGHT * noise_s / np.sqrt(2)
         sigma = {"knots": [at[0], *at.tolist(), at[-1]], "coefficients": spread.tolist(), "degree": 1}
-    # Less fading moves no first path and hardly a bias.
+    # Smaller fading has no significant effect on first paths and bias (a judgement).
     if powers.fading_db >= 0.1:
         life_s = None if powers.fading_life_s is None else max(powers.fading_life_s, SHORTEST_LIFE_S)
         fading = _given(levels_db=powers.fading_levels_db.tolist(), life_s=life_s)
@@ -178,9 +179,9 @@ def _multipath(flight: TwinFlight, fitted: FittedFlight) -> dict[str, Any] | Non
     if found.share < 0.002 and found.direct_std_m == 0:
         return None
     default = TwoStateMultipath(model="two-state")
-    # Where consecutive ranges show no correlation, paths change faster than a pair ranges.
+    # Without correlation of consecutive ranges, paths change faster than a pair ranges.
     life_s = min(default.life_s, flight.interval_s / 3) if found.life_s is None else found.life_s
-    # Pairs whose life is not told have that of all.
+    # Pairs with an undetermined duration have that of all pairs.
     lives = np.maximum(np.nan_to_num(found.pair_life_s, nan=life_s), SHORTEST_LIFE_S)
     columns = (np.clip(found.pair_share, 0, 1), found.pair_excess_m, lives)
     pairs = zip(flight.pairs, *(column.tolist() for column in columns), strict=True)
@@ -219,7 +220,7 @@ def _tag(flight: TwinFlight, known: KnownDevices, fitted: FittedFlight, k: int) 
 
 
 def _bodies(flight: TwinFlight, poses: Poses, duration_s: float) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Return the bodies' tables, and the poses of those that move, from the origin to after the end."""
+    """Return the tables of the bodies, and the poses of moving bodies from the origin to `AFTER_S` after the end."""
     found, paths = [], {}
     for body in dict.fromkeys(tag.body for tag in flight.tags):
         mine = poses[np.flatnonzero(poses.body == body)]
@@ -242,7 +243,7 @@ def _bodies(flight: TwinFlight, poses: Poses, duration_s: float) -> tuple[list[d
 
 
 def _still(mine: Poses) -> dict[str, Any] | None:
-    """Return position and heading of a body that does not move and stands level; None for any other."""
+    """Return position and heading of a body that stands still and level (within 1 cm and 0.01 rad), else None."""
     middle = np.median(mine.position_m, axis=0)
     turns = attitude(mine, str(mine.body[0]), mine.time_ns)
     heading = circmean(turns.as_euler("ZYX")[:, 0], high=np.pi, low=-np.pi)
@@ -253,7 +254,7 @@ def _still(mine: Poses) -> dict[str, Any] | None:
 
 
 def _cut(mine: Poses, origin_ns: int, duration_s: float) -> Poses:
-    """Return poses from the origin on, as long as needed, evenly as many as there were, held beyond the ends."""
+    """Return as many poses as recorded in the flight, at equal intervals, constant beyond the recorded ones."""
     times, rows = np.unique(mine.time_ns, return_index=True)
     last = origin_ns + int((duration_s + AFTER_S) * NS_PER_S)
     count = int(np.clip(np.count_nonzero((times > origin_ns) & (times < last)) + 2, 2, MOST_POSES))
@@ -319,7 +320,7 @@ NOT_DETERMINED_IF: Final[tuple[tuple[Callable[[TwinFlight, FittedFlight], bool],
 
 
 def unknowns(flight: TwinFlight, fitted: FittedFlight) -> Iterator[str]:
-    """Yield a sentence for each property that keeps its default, or was chosen without the recording."""
+    """Yield a sentence for each property that the recording does not determine."""
     interval = flight.interval_s
     for applies, text in NOT_DETERMINED_IF:
         if applies(flight, fitted):

@@ -1,4 +1,4 @@
-"""Calibrations in other forms, and MILUV's both ways."""
+"""Calibrations in other formats, and the format of MILUV in both directions."""
 
 import csv
 import json
@@ -42,7 +42,7 @@ def test_registers_go_on_top_of_what_was_programmed(tmp_path, fitted):
     found = registers(known, programmed(tmp_path / "r.uwb"))
     d = 0.25e-9 / TICK_S
     assert found[1] == (round(16440 - 0.44 * d), round(16430 - 0.56 * d), 16440)
-    # A device with nothing programmed: both registers together are its whole delay, not 32872 ticks more.
+    # A device with registers of zero: both registers together are its whole delay, not 32872 ticks more.
     assert sum(found[2][:2]) == pytest.approx(513.5e-9 / TICK_S, abs=1)
     with pytest.raises(calib.BadInputError, match="tag 1: its registers would be -7/-9"):
         registers(known, {None: AntennaDelay(0, 0, 0)})
@@ -94,7 +94,7 @@ def pattern(tags, seed):
     ids=lambda change: next(iter(change), "plain"),
 )
 def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
-    # A tag that was not there when the fit was made has pairs that nothing is known of.
+    # A tag that was not fitted: nothing is known of its pairs.
     known = replace(fitted, delays_ns=DELAYS_NS | {50: 0.1}, **change)
     random, tags = np.random.default_rng(8), sorted(known.delays_ns)
     rows = [
@@ -104,7 +104,7 @@ def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
     one, two = tags[:2]
     rows += [(1.0, 0.0, -85.0, one, two), (1.0, -85.0, math.nan, one, two), (1.0, 0.0, 0.0, one, two)]
     away = random.normal(size=(len(rows), 2, 3))
-    # The same precision as in `Ranges`, so that both sides have the same numbers; every tenth direction is unknown.
+    # With the precision of `Ranges`, both sides have equal numbers; every tenth direction is unknown.
     away = (away / np.linalg.norm(away, axis=2, keepdims=True)).astype(np.float32)
     away.reshape(-1, 3)[::10] = math.nan
     every = [*rows, (1.0, -85.0, -85.0, 9999, one)]
@@ -126,10 +126,10 @@ def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
         seen = known.apply(replace(one_range, toward=toward[None]))
         other = (blind.range_m, blind.sigma_total_m, seen.mean_error_m[0], seen.tail_share[0])
         assert told == pytest.approx((seen.sigma_total_m[0], *other), abs=1e-12, nan_ok=True)
-        # Without a power a range has the delays' part only.
+        # Without a power, a range is corrected for delays only.
         assert corrected == pytest.approx(seen.corrected_m[0] if status != "2" else blind.range_m, abs=1e-12)
         assert sigma == pytest.approx(blind.sigma_m, abs=1e-12, nan_ok=True)
-        assert (status != "0") == blind.clamped
+        assert ((status == "1"), (status == "2")) == (blind.clamped, np.isnan(blind.sigma_m))
     assert len({share for *_, share in found}) > 100, "shares differ by pair and power"
     assert ({status for status, *_ in found}, found[-1][0]) == ({"0", "1", "2", "-1"}, "-1")
     corrected, blind = np.array([(one[1], one[4]) for one in found], dtype=float).T
@@ -148,7 +148,9 @@ def test_miluv_is_read_and_given_back_unchanged():
 
 @pytest.mark.slow
 def test_the_published_calibration_gives_the_published_ranges(tmp_path):
-    """Within what a fault of the authors' code adds: it corrects the last stamp with the wrong tag's delay."""
+    """Ranges agree within the effect of a fault in the authors' code: it corrects the last stamp with the delay of the
+    wrong tag.
+    """
     folder = miluv(tmp_path)
     e = read_source(folder, importer="miluv").exchanges
     published = {}

@@ -1,4 +1,4 @@
-"""The calibration file, and what applying it does."""
+"""The calibration file, and the correction of ranges."""
 
 import itertools
 import json
@@ -38,7 +38,7 @@ def lifted(dbm):
 
 
 def powers_at(lift, power_at, first, second):
-    """Return the lifted powers at which the bias is taken."""
+    """Return the lifted powers at which the bias is evaluated."""
     if power_at == "reception":
         return [lifted(first), lifted(second)]
     return [lifted((first + second) / 2) if lift == "lift-of-mean" else (lifted(first) + lifted(second)) / 2]
@@ -50,7 +50,9 @@ def powers_at(lift, power_at, first, second):
 )
 @pytest.mark.parametrize("grouped", [False, True])
 def test_a_range_is_corrected_as_the_formulas_say(fitted, lift, power_at, grouped):
-    """Half of each delay and the mean curve of both tags, at the powers that there are; one at a time or together."""
+    """A range is corrected by half of each delay and the mean curve of both tags, at the available powers; one range,
+    or arrays.
+    """
     lower = replace(fitted.bias_curve, coefficients=tuple(c - 0.1 for c in fitted.bias_curve.coefficients))
     noisy = replace(fitted.sigma_curve, coefficients=tuple(2 * c for c in fitted.sigma_curve.coefficients))
     own = {"a": TagGroup((1, 2), fitted.bias_curve, fitted.sigma_curve), "b": TagGroup((3, 7), lower, noisy)}
@@ -76,6 +78,7 @@ def test_a_range_is_corrected_as_the_formulas_say(fitted, lift, power_at, groupe
     blind = known.correct(3.0, 0.0, np.nan, 1, 2)
     assert blind.range_m == pytest.approx(3.0 + SPEED_OF_LIGHT * 5e-10 * (known.delays_ns[1] + known.delays_ns[2]))
     assert np.isnan([blind.sigma_m, blind.sigma_total_m, blind.tail_share]).all()
+    assert not blind.clamped
     far = known.correct(3.0, -60.0, -60.0, 1, 2)
     assert far.clamped
     assert far.sigma_total_m > known.correct(3.0, -79.0, -79.0, 1, 2).sigma_total_m
@@ -124,7 +127,7 @@ def test_a_damaged_file_is_one_clear_error(fitted, old, new):
         Calibration.from_json(text.replace(old, new), "here")
 
 
-# A corrected recording: the ranges that `evaluate` sees, and every other row of every table as it was.
+# A corrected recording: the ranges that `evaluate` uses, and all other rows of all tables unchanged.
 
 
 def full_recording(path):
@@ -142,7 +145,7 @@ def full_recording(path):
     ).save(path)  # fmt: skip
     with Recording.open(path, update=True) as recording:
         recording.append("overheard", [{name: float(k) for k, name in enumerate(TABLES["overheard"])}])
-        # And not "corrected", which is what is made.
+        # Without "corrected", which is the result.
         for table in (
             "imu",
             "height",
@@ -213,7 +216,7 @@ def test_ranges_without_power_are_counted_apart(corrected):
     names, table = rows(folder / "c.uwb", "corrected")
     beyond, unpowered = (np.array([row[names.index(n)] for row in table], float) for n in ("clamped", "sigma_m"))
     assert ((done.count, done.unpowered), done.unpowered) == ((600, 7), np.count_nonzero(np.isnan(unpowered)))
-    assert done.clamped == np.count_nonzero(beyond[np.isfinite(unpowered)])
+    assert done.clamped == np.count_nonzero(beyond)
 
 
 @pytest.mark.filterwarnings("ignore:1 differences of arrival without stamps are copied")
@@ -227,7 +230,7 @@ def test_blocks_of_any_size_are_corrected_alike(corrected, tmp_path, monkeypatch
         assert repr(rows(tmp_path / "c.uwb", table)) == repr(rows(folder / "c.uwb", table))
 
 
-# What errors are made of, in densities by SciPy and in files; their moments and quantiles: tests/calib/report.
+# Parts of errors, against densities by SciPy, and in files; moments and quantiles are in tests/calib/report.
 
 
 MODEL = ErrorModel(
@@ -307,7 +310,7 @@ def test_a_damaged_model_is_one_clear_error(error_fitted, key, value, said):
 
 
 def test_a_fit_says_how_long_errors_of_a_pair_last():
-    """Half of the variance is a Gauss-Markov process of each pair that forgets in half a second."""
+    """Half of the variance is a Gauss-Markov process of each pair with a correlation time of half a second."""
     flight = calib.load_ranges(calib.sample_flight(9000))
     rng, shared = np.random.default_rng(5), np.zeros(len(flight))
     for pair in range(3):
@@ -342,17 +345,17 @@ def test_shares_that_are_none(error_fitted, shares):
         error_fitted.quantiles(calib.load_ranges(calib.sample_flight()), shares)
 
 
-# Two calibrations side by side.
+# Comparison of two calibrations.
 
 
 @pytest.mark.slow
 def test_fits_of_the_same_tags_are_the_same_nineteen_times_in_twenty():
     fits = [calib.fit(ranges(3000, seed=seed)).calibration for seed in range(9)]
     found = [calib.compare(a, b) for a, b in itertools.pairwise(fits)]
-    # 8 comparisons, 0.4 expected to differ; more than three come by chance less than once in a thousand.
+    # 8 comparisons with 0.4 expected differences; more than three occur by chance in less than one of a thousand cases.
     assert sum(one.same for one in found) >= 5
-    # Four delays less a shift: chi-square with 3 degrees of freedom, whose mean over 8 is known to 0.9 or so;
-    # intervals allow for small samples and for reflections of unknown shape, and are a little wide for it.
+    # Four delays minus a shift: chi-square with 3 degrees of freedom, whose mean over 8 has a standard error of 0.9.
+    # Intervals allow for small samples and for the unknown shape of reflections, so they are slightly wide.
     assert 0.9 < np.mean([one.chi_square for one in found]) < 5.0
     assert 0.55 < np.std([d / one.std_ns[t] for one in found for t, d in one.difference_ns.items()]) < 1.3
 
@@ -380,7 +383,7 @@ def test_nothing_in_common_cannot_be_compared(fitted):
 
 
 def test_of_pairs_that_are_not_determined_the_others_are_corrected_and_they_are_named(tmp_path):
-    """Two tags and two anchors; in the second flight the tags range with each other, too."""
+    """Two tags and two anchors; in the second flight the tags also range with each other."""
     flight = calib.sample_flight(180)
     e = flight.exchanges
     lower = np.sort(np.unique(np.append(e.initiator, e.target)))[0]
@@ -397,7 +400,7 @@ def test_of_pairs_that_are_not_determined_the_others_are_corrected_and_they_are_
     for name in ("two.uwb", "one.uwb"):
         assert rows(tmp_path / name, "corrected") == rows(tmp_path / "one.uwb", "corrected")
         assert rows(tmp_path / name, "exchanges") == rows(tmp_path / "one.uwb", "exchanges")
-    # Evaluation and localization do the same.
+    # Evaluation and localization also leave these pairs out.
     for command in (("evaluate",), ("localize", "--seeds", 1)):
         said = [succeed("calib", *command, name, "-c", "c.json", cwd=tmp_path) for name in ("across.uwb", "all.uwb")]
         assert said[0].stdout.replace("across.uwb", "all.uwb").split() == said[1].stdout.split()

@@ -28,7 +28,7 @@ def save(flight, path):
 
 
 def imported(folder, names, rows, settings):
-    """Write and import a table of stamps in nanoseconds; returns the recording."""
+    """Write and import a table of stamps in nanoseconds; return the recording."""
     with (folder / "t.csv").open("w", newline="") as out:
         csv.writer(out).writerows([names, *rows])
     (folder / "m.toml").write_text(f'{settings}\n[units]\nstamps = "ns"\n')
@@ -76,7 +76,7 @@ STAMPS = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
 STARLOC = ["time_s", "from_id", "to_id", *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "range"]
 STARLOC_DATA = "starloc_loop-2d-fast.tar.xz"
 RADIOS = {11: 10, 7: 11, 4: 12, 10: 13, 5: 15, 6: 16, 12: 6, 9: 9}
-"""The marker of each radio, as the data's page says."""
+"""The marker of each radio, from the page of the data set."""
 
 
 @pytest.fixture(scope="module")
@@ -89,9 +89,9 @@ def starloc():
     ("marker_of", "wrong", "exchanged"),
     [
         pytest.param(RADIOS, set(), {}, marks=pytest.mark.slow),
-        # Radio 11 is 1.25 m above its marker then, which the rig, which keeps its height, does not determine.
+        # Radio 11 is 1.25 m above its marker, in a direction that the rig, which keeps its height, does not determine.
         ({radio: radio for radio in RADIOS}, {"tag10", "tag12"}, {}),
-        # Radio 6 is where 12 should be, above 4, and 12 where 4 should be, above 6.
+        # Radio 6 is at the place of 12, above 4, and 12 at that of 4, above 6.
         pytest.param(
             dict(zip(sorted(RADIOS), sorted(RADIOS.values()), strict=True)),
             set(),
@@ -123,7 +123,7 @@ def test_markers_that_are_other_radios_are_seen(starloc, tmp_path, marker_of, wr
 
 
 def test_coarse_ranges_that_follow_fast_are_not_doubled_exchanges(tmp_path):
-    """At 33 Hz a pair, in centimetres and whole decibels, one row in fifty equals the pair's last."""
+    """At 33 Hz per pair, with centimetres and whole decibels, one row in fifty equals the previous one of its pair."""
     numbers = RNG(1).normal((3.0, -80.0), (0.04, 1.0), (3000, 2))
     ends = ("1,2", "1,3", "2,3")
     lines = [f"{k / 100:.2f},{ends[k % 3]},{r:.2f},{p:.0f},3.0" for k, (r, p) in enumerate(numbers)]
@@ -141,7 +141,7 @@ def test_logs_of_both_robots_are_doubled_exchanges(tmp_path):
     }
     in_time = sorted(logged, key=lambda row: float(row["timestamp"]))
     path = imported(tmp_path, names, [[row[theirs] for theirs in names.values()] for row in in_time], "bits = 40")
-    # The import takes each exchange once; what is made without it is not so careful.
+    # The import uses each exchange once; data that did not pass the import may have them twice.
     with uwblink.Recording.open(path) as recording:
         once = recording.exchanges()
     assert (len(once), calib.examine(path)) == (len(logged) - 123, [])
@@ -151,10 +151,10 @@ def test_logs_of_both_robots_are_doubled_exchanges(tmp_path):
 
 
 def test_power_and_distance_are_not_confounded_outdoors(tmp_path):
-    """Two boards on tripods, 2 to 60 m apart: distance explains 82 % of the power, and leaves enough."""
+    """Two boards on tripods, 2 to 60 m apart: distance explains 82 % of the power, which still determines a curve."""
     table = shared("hanyang_sstwr.csv.gz")
     uwblink.import_recording(table, tmp_path / "h.uwb", map_file=ROOT / "docs" / "maps" / "hanyang.toml")
-    # A pole and a tripod do not move, so what is reflected is so for as long as they stand.
+    # A pole and a tripod do not move, so reflections last as long as they stand.
     assert {one.fault for one in calib.examine(tmp_path / "h.uwb")} == {
         "too few pairs",
         "single-sided without carrier readings",
@@ -163,7 +163,9 @@ def test_power_and_distance_are_not_confounded_outdoors(tmp_path):
 
 
 def test_two_seconds_of_one_pair_say_nothing_of_power_and_distance():
-    """Distance explains three fifths of the power, directions the rest; of 2 s, which count as one value, no share."""
+    """Distance explains three fifths of the power and directions the rest; 2 s count as one value, so no share is
+    significant.
+    """
     random, rows = np.random.default_rng(4), 1200
     truth_m = 3 + np.sin(np.linspace(0, 60, rows))
     power_dbm = -76 - 3 * truth_m + 2.5 * np.sin(np.linspace(0, 37, rows)) + 0.3 * random.standard_normal(rows)
@@ -176,7 +178,7 @@ def test_two_seconds_of_one_pair_say_nothing_of_power_and_distance():
 
 @pytest.mark.slow
 def test_a_fit_in_a_room_settles():
-    """Steps by the information alone do not settle here in a hundred."""
+    """Steps by the information matrix alone do not converge here within a hundred iterations."""
 
     room = uwbsim.simulate(uwbsim.load("room/room", {"run.duration_s": 60.0, "run.seed": 50_000}))
     assert calib.fit(calib.Ranges.from_exchanges(room.exchanges, poses=room.poses, tags=room.tags).usable()).success

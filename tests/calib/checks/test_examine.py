@@ -1,4 +1,4 @@
-"""Each fault is planted in a flight, and `calib.examine` names it, with its size and place, and nothing else."""
+"""Each fault is planted in a flight; `calib.examine` names it, with size and place, and finds nothing else."""
 
 import re
 import tomllib
@@ -30,7 +30,7 @@ LOUD = {
     "radio.shadowing_db": 0.0,
     "radio.saturation_dbm": -50.0,
 }
-"""A radio whose powers end nowhere, and follow distance: tags on one frame are at -68 dBm."""
+"""A radio whose powers do not saturate and depend on distance: tags on one frame read -68 dBm."""
 
 
 def faults(flight):
@@ -47,7 +47,7 @@ def numbers(text):
 
 
 def longer(metres, of):
-    """Return a planting that makes ranges longer by `metres` where `of(flight)` says so."""
+    """Return a planting that lengthens ranges by `metres` in the rows `of(flight)`."""
     return lambda flight, _: planted.longer(flight, np.where(of(flight), metres, 0.0))
 
 
@@ -86,7 +86,7 @@ def late_poses(by_ns):
 
 
 def turned_with_gaps(flight, rng):
-    """Turned attitudes, some of which are unknown: NaN, or zero."""
+    """Rotated attitudes, some of which are unknown: NaN, or zero."""
     quaternion = planted.turned_attitudes(flight, rng).poses.quaternion
     quaternion[::50], quaternion[1::50] = np.nan, 0.0
     return replace(flight, poses=replace(flight.poses, quaternion=quaternion))
@@ -200,10 +200,9 @@ def test_all_that_is_wrong_is_named(plan, plant, expected):
 
 
 def test_recordings_of_scenarios_without_a_fault_have_no_finding():
-    """Anchors keep one power for each pair, and distance explains up to 83 % of it.
-
-    Tags on one frame read powers thirty times those of others: the curve, rough at low powers, is flat between them.
-    Among six robots one tag has 5 % of reflected ranges, and the others 2 %.
+    """Anchors have a constant power for each pair, and distance explains up to 83 % of it. Tags on one frame read
+    powers thirty times those of others: the curve, rough at low powers, is flat between them. Among six robots one tag
+    has 5 % of reflected ranges, and the others 2 %.
     """
 
     for name, expected, changed in (
@@ -226,7 +225,7 @@ def test_the_remedy_for_attitudes_of_another_frame_undoes_it():
     mended = (Rotation.from_quat(factor) * given).as_quat()
     back = replace(turned, poses=replace(turned.poses, quaternion=mended))
     assert faults(back) == []
-    # The planted turn, to 10 degrees: a lever arm of 0.2 m then is 3.5 cm off.
+    # The planted rotation, within 10 degrees: a lever arm of 0.2 m is then 3.5 cm off.
     true = Rotation.from_quat(flight.poses.quaternion)
     assert np.degrees((Rotation.from_quat(mended) * true.inv()).magnitude()).max() < 10
 
@@ -240,7 +239,7 @@ def test_poses_that_repeat_because_the_body_stands_still_are_sound(seed):
     )
     assert "frozen poses" in faults(frozen)
     assert "frozen poses" not in faults(planted.longer(frozen, here - there))
-    # The remedy: the poses that repeat the one before are deleted.
+    # The remedy: poses that repeat the previous one are deleted.
     poses = frozen.poses
     kept = [
         own[np.append(True, np.any(np.diff(poses.position_m[own], axis=0), axis=1))]
@@ -257,7 +256,7 @@ def test_reflections_in_the_last_seconds_are_no_change_of_a_delay(plan, seed):
 @pytest.mark.parametrize(
     ("plan", "plant"),
     [
-        # All tags, one pair, and a body in the way that goes again.
+        # All tags, one pair, and a body in the line of sight for a while.
         (replace(SHORT, tags_a_body=1, bodies=4), longer(0.15, lambda f: planted.seconds(f) > 20)),
         (
             SHORT,
@@ -277,7 +276,7 @@ def test_a_step_is_named_with_tag_size_and_time():
     stepped = longer(-0.09, lambda f: planted.of_tag(f, 21) & (planted.seconds(f) > 25))(fly(SHORT, 44), None)
     tag, size_cm, time_s, size_ns, *_ = numbers(only(stepped, "delay changed mid-flight").evidence)
     assert tag == 21
-    # 270 ranges of the tag on either side at 5 cm: a standard error of 0.5 cm.
+    # 270 ranges of the tag before and after, at 5 cm: a standard error of 0.5 cm.
     assert [size_cm, time_s] == pytest.approx([-9, 25], abs=1.5)
     assert size_ns == pytest.approx(0.09 / LIGHT * 2e9, abs=0.1)
 
@@ -305,12 +304,12 @@ def test_a_pair_that_does_not_close_is_named_with_its_size(plant, named, size_cm
     found = only(plant(fly(ONE_EACH, 47), RNG(3)), "pairs that do not close")
     assert found.evidence.startswith(f"ranges of {named}")
     assert "too long" in found.evidence
-    # The median of a pair's errors lies above their core, so that the clipped mean beside it does not weigh the same.
+    # The median error of a pair lies above the core, so the clipped mean has another weight.
     assert numbers(found.evidence.split(" are ")[1])[0] == pytest.approx(size_cm, abs=3)
 
 
 def test_pairs_that_a_cabinet_hides_are_named():
-    """Tag 1 sees the third quadcopter through metal: medians of its two pairs are 25 and 17 cm too long."""
+    """Tag 1 and the third quadcopter have metal between them: medians of their two pairs are 25 and 17 cm too long."""
 
     room = uwbsim.simulate(uwbsim.load("room/room", {"run.duration_s": 60.0, "run.seed": 50_004}))
     named = [one.evidence.split()[3] for one in calib.examine(room) if one.fault == "pairs that do not close"]
@@ -318,7 +317,7 @@ def test_pairs_that_a_cabinet_hides_are_named():
 
 
 def with_places(flight, places):
-    """Return a flight whose anchors stand elsewhere, by the names of their bodies."""
+    """Return a flight whose anchors have other recorded positions, by the names of their bodies."""
     position_m = flight.poses.position_m.copy()
     for body, place in places.items():
         position_m[flight.poses.body == body] = place
@@ -326,7 +325,7 @@ def with_places(flight, places):
 
 
 def lines_of(finding):
-    """Return what a remedy says that should stand in a map."""
+    """Return the lines in a remedy that a map should contain."""
     return tomllib.loads(finding.remedy[finding.remedy.index("[[") :])
 
 
@@ -384,7 +383,7 @@ def test_true_distances_of_an_anchor_that_is_nobodys_place_are_named():
 
 
 def test_where_anchors_stand_is_told_with_intervals_and_as_lines_of_a_map():
-    """All four are 30 cm off at once."""
+    """All four anchors are 30 cm off at once."""
     scores = []
     for seed in range(90_100, 90_104):
         flight, rng = fly(ANCHORS, seed), RNG(seed)
@@ -399,12 +398,12 @@ def test_where_anchors_stand_is_told_with_intervals_and_as_lines_of_a_map():
             (line,) = lines_of(one)["anchors"]
             assert line["id"] == 100 + int(body[6:])
             np.testing.assert_allclose(line["position_m"], wrong[body] + axes[:, 0], atol=0.006)
-    # Of 48 95 % intervals at least 43 hold in 97 % of such trials.
+    # Of 48 95 % intervals, at least 43 contain the true value in 97 % of such trials.
     assert np.count_nonzero(np.abs(scores) < 1) >= 43
 
 
 def test_ranges_between_anchors_tell_their_places_too():
-    """The tags that move say in which direction an anchor is off to 19 cm only."""
+    """The moving tags determine the direction of an anchor's displacement only to 19 cm."""
 
     flight = uwbsim.simulate(uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.seed": 77_001}))
     true, off = np.array([-2.96, 0.61, 1.66]), np.array([0.2, 0.1, 0.1])
@@ -429,7 +428,7 @@ def test_anchors_that_are_all_off_are_not_taken_for_walls_between_them(seed):
         true, given = (one.poses.position_m[one.poses.body == body][0] for one in (flight, off))
         size, wide = np.array(told, dtype=float).reshape(3, 2).T
         scores += list((size + given - true) / wide)
-    # Of nine 95 % intervals two fail in 1 % of trials, and seeds have as many at least.
+    # Of nine 95 % intervals, two fail in 1 % of trials; there are more seeds than that.
     assert len(scores) >= 9
     assert np.count_nonzero(np.abs(scores) > 1) <= 0.2 * len(scores)
     assert {row["id"] for row in lines_of(found)["anchors"]} == {int(body[6:]) for body, *_ in axes}
@@ -460,7 +459,7 @@ def test_a_delay_that_changed_between_recordings_is_named_with_its_size():
     (finding,) = calib.examine([first, longer(0.12, lambda f: planted.of_tag(f, 40))(second, None)])
     assert finding.fault == "delay changed between recordings"
     assert numbers(finding.evidence)[1] == pytest.approx(12, abs=2)
-    # Where other pairs change as much, it is no delay of one tag.
+    # If other pairs change as much, the fault is not a delay of one tag.
     e = second.exchanges
     pair = np.minimum(e.initiator, e.target) * 100 + np.maximum(e.initiator, e.target)
     by_others = np.where(np.isin(pair, [2030, 2040, 3050]), 0.2, -0.2)
@@ -493,7 +492,7 @@ def test_reflections_that_last_are_named_with_their_life():
     plan = replace(SHORT, seconds=150, tags_a_body=1, share=0.2, lasts_s=4.0)
     found = only(fly(plan, 55), "reflections that last")
     lives = [float(life) for life in re.findall(r"for ([\d.]+) s at a time", found.evidence)]
-    # A few dozen spells a pair, of which the short detours are not seen.
+    # A few dozen spells per pair, of which those with short detours are not detected.
     assert 1.5 < np.median(lives) < 9
 
 

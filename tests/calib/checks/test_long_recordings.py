@@ -1,4 +1,4 @@
-"""A long recording is looked at in stretches, and what is wrong with it shows in them."""
+"""A long recording is examined in stretches of time, and its faults are detected in them."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The doctor on recordings of boards that stood still: what contradicts a survey is named, and nothing else."""
+"""The doctor on recordings of boards that stand still: contradictions of a survey are named, and nothing else."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ HELD_NS = 70_000_000_000
 
 
 def save(world, path, known="line", distances=(), power_dbm=None):
-    """Write a world as a recording of double-sided exchanges, its arrangements marked."""
+    """Write a world as a recording of double-sided exchanges, with its arrangements."""
     r, count = world.ranges, len(world.places)
     power = r.fpp1_dbm if power_dbm is None else np.full(len(r), power_dbm)
     x = stamped(r.time_ns, np.column_stack([r.initiator, r.target]), r.raw_m, np.stack([power, power]))

@@ -1,4 +1,4 @@
-"""A fit that doubts itself: no wrong delay without a word, and no word about sound worlds."""
+"""Warnings of fits: no wrong delay without a warning, and no warning in sound worlds."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ NAMED = {
     "truth 2 % short": "grow with the distance",
     "antenna delays of 514 ns not configured": "larger than differences of boards",
 }
-"""What the first sentences must name; the others need only be right, or doubted."""
+"""Faults that a warning must name; fits with other faults must be correct, or have a warning."""
 
 
 def planted(name):
@@ -48,7 +48,7 @@ def planted(name):
 
 
 def wrong(world, found):
-    """Return the errors of delays about their common shift, over their printed standard errors."""
+    """Return the errors of delays after a common shift, divided by their stated standard errors."""
     error, std = about_their_mean(found.calibration, world.delays_ns)
     return error / std
 
@@ -84,7 +84,7 @@ def test_shares_of_reflections_that_differ_by_pair_do_not_pull_delays():
         delays = calib.fit(world.ranges).calibration.delays_ns
         error = np.array([delays[tag] - known for tag, known in world.delays_ns.items()])
         errors.append(error - error.mean())
-    # With one share for all pairs it is 20 ps; 15 are asked for, 5 are found.
+    # With one share for all pairs it is 20 ps; the bound is 15 ps, and 5 ps are found.
     assert np.sqrt(np.mean(np.square(errors))) < 0.010
 
 
@@ -98,12 +98,12 @@ def test_intervals_hold_where_errors_last():
     for seed in range(5):
         world = make(CLEAN["persistent 1 s, 2 cm over 3 s, 90 s"], seed)
         scores.append(wrong(world, calib.fit(world.ranges)))
-    # Of 25 errors, 24 should be within two standard errors; blocks of time of a given length leave 16.
+    # Of 25 errors, 24 should be within two standard errors; with blocks of time of a fixed length it would be 16.
     assert np.mean(np.abs(scores) < 1.96) > 0.85
 
 
 def distances_late_by(ranges, seconds):
-    """Return ranges whose true distances are those of an earlier time, between the same two tags."""
+    """Return ranges with true distances of an earlier time, between the same two tags."""
     truth, time_s = ranges.truth_m.copy(), ranges.time_ns * 1e-9
     pair = np.minimum(ranges.initiator, ranges.target) * 100 + np.maximum(ranges.initiator, ranges.target)
     for one in np.unique(pair):
@@ -125,7 +125,7 @@ def test_distances_in_a_wrong_unit_are_named():
 
 
 def test_a_sequential_fit_takes_the_curve_for_no_wall():
-    """The curve that is fitted after the delays is in the errors of all ranges between two bodies."""
+    """The errors of all ranges between two bodies contain the curve, which is fitted after the delays."""
     ranges = ranges_with_field(60_005, bodies=3, seconds=60)[0]
     lifted = np.mean(10 ** ((np.array([ranges.fpp1_dbm, ranges.fpp2_dbm]) + 82) / 10), axis=0)
     ranges = replace(ranges, raw_m=ranges.raw_m + 0.15 * np.exp(-lifted / 0.4))
@@ -135,7 +135,9 @@ def test_a_sequential_fit_takes_the_curve_for_no_wall():
 
 @pytest.mark.parametrize(("noise_db", "seed", "place"), [(0.3, 101, False), (1.0, 5, True)])
 def test_noise_of_powers_that_follow_the_distance_is_not_called_places_alone(noise_db, seed, place):
-    """Nothing belongs to places here; with much noise in the powers the curve is too flat, which looks so."""
+    """No error depends on places here; with much noise in the powers, the curve is too flat, which has a similar
+    effect.
+    """
 
     radio = {"first_path_at_1m_dbm": -78.0, "shadowing_db": 0.0, "saturation_dbm": -50.0, "power_noise_db": noise_db}
     settings = {"run.duration_s": 12.0, "run.seed": seed} | {f"radio.{name}": value for name, value in radio.items()}

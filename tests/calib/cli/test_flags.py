@@ -1,4 +1,4 @@
-"""The command line names options where the library names parameters, and makes the fit's options of its settings."""
+"""The command line names options instead of parameters, and derives the options of a fit from its settings."""
 
 import json
 import re
@@ -25,16 +25,16 @@ from uwblink import Contents, KnownDistance, Recording
 
 COMMANDS: Any = typer.main.get_command(app)
 OPTIONS = {o for _, command in leaves(COMMANDS, ("calib",)) for parameter in command.params for o in parameter.opts}
-# Not options: the power of the lifting, which all calibrations share, and what only functions take.
+# Without an option: the power of the lifting, equal for all calibrations, and parameters of functions only.
 ONLY_FROM_PYTHON = {
     *("alpha_dbm", "data", "truth_m", "range_m", "target", "weights", "protocol", "name", "before", "section"),
     *("shares", "start_m", "information", "loosest", "boards", "robots"),
     # Named by the command itself, as its own option.
     *("seconds", "speed_m_s", "apart_m", "still_s", "noise_m", "size_m", "rate_hz", "tape_sigma_m", "anchor_sigma_m"),
     *("anchor_places", "reference"),
-    # Parts of the error of ranges and of differences of arrival.
+    # Parts of the errors of ranges and of differences of arrival.
     *("side", "odds"),
-    # Of ranges from arrays.
+    # Parameters of ranges from arrays.
     *("features", "temperature_c"),
 }
 
@@ -78,7 +78,7 @@ def test_a_fit_repeats_its_settings(tmp_path):
     assert "settings: loss = huber, fixed_ns = {'1': -0.3}" in processes.run("calib", "show", made).stdout
 
 
-# `calib fit --truth ranges`, as one types it.
+# `calib fit --truth ranges`, as entered by a user.
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,7 @@ def test_what_does_not_go_together_is_one_line(recording, tmp_path, words, said)
     assert not (tmp_path / "c.json").exists()
 
 
-# A table of ranges with power and places, no stamps, robots and anchors: import, curve, localization, by commands.
+# A table of ranges with powers and positions but no stamps, with robots and anchors: import, curve, localization.
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fitted(folder):
-    """What the command prints that writes c.json."""
+    """Return the output of the command that writes c.json."""
     return run("calib", "fit", folder / "ranges.uwb", "-o", folder / "c.json")
 
 
@@ -150,7 +150,7 @@ def test_import_curve_localization(folder, fitted):
     written = json.loads((folder / "c.json").read_text())
     middle = sum(written["delays_ns"][str(tag)] - delay for tag, delay in DELAYS_NS.items()) / len(DELAYS_NS)
     for tag, delay in DELAYS_NS.items():
-        # Delays are stated for a curve that is zero at -82 dBm, so all are moved alike.
+        # Delays are stated for a curve that is zero at -82 dBm, so all are shifted equally.
         assert written["delays_ns"][str(tag)] - middle == pytest.approx(delay, abs=0.05)
     assert any("ranges without stamps" in warning for warning in written["provenance"]["warnings"])
     assert "ranges without stamps" in run("calib", "show", folder / "c.json").stdout
@@ -191,7 +191,7 @@ def test_one_pair_is_evaluated_without_a_number_between_pairs(folder):
     assert "nan" not in told
 
 
-# A fit that stopped before it converged says so wherever its calibration goes, and does not end as if all were well.
+# A fit that stopped before it converged is marked as such wherever its calibration is used, and exits with status 1.
 
 
 @pytest.fixture

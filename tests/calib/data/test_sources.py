@@ -1,4 +1,4 @@
-"""Ranges from files, open recordings, objects in memory and arrays: all the same, and mistakes are named."""
+"""Ranges from files, open recordings, objects in memory and arrays are equal, and errors name the fault."""
 
 import builtins
 import math
@@ -75,7 +75,7 @@ def test_every_function_takes_what_a_fit_takes(tmp_path):
 
 
 def test_a_strangers_object_will_do():
-    """Somebody else's object, with nothing but the attributes that a source needs."""
+    """An object of another class, with only the attributes that a source needs."""
     flight = sample_flight()
     bare = SimpleNamespace(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags)
     assert load_ranges(bare).planted is None
@@ -193,7 +193,7 @@ def test_poses_without_time_or_body_are_refused(tmp_path):
 
 
 def test_bodies_with_one_pose_do_not_split_what_is_read(tmp_path):
-    """A hundred anchors have a pose each: thousands of exchanges are read in one part, not one by one."""
+    """A hundred anchors have one pose each: thousands of exchanges are read in one part, not one by one."""
     flight = sample_flight(3000)
     path = written(tmp_path / "it.uwb", flight, {})
     with uwblink.Recording.open(path, update=True) as recording:
@@ -206,16 +206,16 @@ def test_bodies_with_one_pose_do_not_split_what_is_read(tmp_path):
     assert parts == [3000]
 
 
-# Data frames in and out: of pandas, of Arrow, and of anything with Arrow's interface in C, as Polars has it.
+# Data frames in and out: of pandas, Arrow, and others with Arrow's C interface, such as Polars.
 
 
 N = 600
 TAGS = {"AN0": -0.3, "AN1": 0.2, "drone": 0.1}
-C = 0.299792458  # m/ns, written out
+C = 0.299792458  # m/ns, written as a number
 
 
 def frame(**changes):
-    """Return ranges of three tags with planted delays, in words and units of their owner."""
+    """Return ranges of three tags with planted delays, with column names and units of another program."""
     rng = np.random.default_rng(4)
     pair = np.array([("drone", "AN0"), ("drone", "AN1"), ("AN0", "AN1")])[np.arange(N) % 3]
     truth = rng.uniform(1, 6, N)
@@ -235,7 +235,7 @@ MAP = {"columns": {"range_m": "distance_mm", "fpp2": "fpp_dbm", "time_s": "stamp
 
 
 class OfAnotherLibrary:
-    """A table whose library is known by Arrow's interface only."""
+    """A table of a library that only has Arrow's interface."""
 
     def __init__(self, table):
         self.table = table
@@ -245,7 +245,7 @@ class OfAnotherLibrary:
 
 
 def planted_difference(result, loaded):
-    """Return the error of the difference of two delays, in ns; names of tags come from the import."""
+    """Return the error of the difference of two delays, in ns; names of tags are from the import."""
     tag = {body: number for number, body in loaded.bodies}
     delays = result.calibration.delays_ns
     return delays[tag["AN1"]] - delays[tag["AN0"]] - (TAGS["AN1"] - TAGS["AN0"])
@@ -269,7 +269,7 @@ def test_a_frame_with_plain_names_needs_no_map_and_says_what_it_assumed():
     with pytest.warns(UserWarning, match="3 ids are words"):
         result = calib.fit(plain)
     assert len(result.ranges) == N
-    # 200 ranges a pair of 2 cm: 1.4 mm, or 9 ps of a sum of delays.
+    # 200 ranges per pair with 2 cm of noise: 1.4 mm, or 9 ps of a sum of delays.
     assert abs(planted_difference(result, result.ranges)) < 0.04
     with pytest.warns(UserWarning, match="3 ids are words"):
         assert calib.fit(plain.set_index("stamp")).calibration.delays_ns == result.calibration.delays_ns
@@ -355,19 +355,22 @@ def test_without_pandas_one_line_says_what_to_do(monkeypatch):
         calib.load_ranges(calib.sample_flight()).to_pandas()
 
 
-# Clock ratios by third messages against carriers' readings: what is planted is named, and nothing else.
+# Clock rates by third messages against readings of the carriers: a planted fault is named, and nothing else.
 
 
 PPM = np.array([0.0, 4.0, -3.0, 1.5])
-"""By how much the clock of a tag is fast."""
+"""Rate of each tag's clock in ppm."""
 
 
 def exchanges(stamps_ppm=None, sign=1.0, noise_ppm=0.3):
-    """Return a sample flight whose third messages and carriers tell of the clocks; `stamps_ppm` is of tags 1 to 3."""
+    """Return a sample flight whose third messages and carriers contain clock rates; `stamps_ppm` are those of tags 1 to
+    3.
+    """
     flight = calib.sample_flight(900).exchanges
     rng = np.random.default_rng(4)
     fast = PPM if stamps_ppm is None else np.array([0.0, *stamps_ppm])
-    # The third message leaves the target 15 ms after its second, in its own ticks; the initiator counts in others.
+    # The third message leaves the target 15 ms after its second, in ticks of its clock; the initiator counts other
+    # ticks.
     span = 0.015 / TICK_S
     target, initiator = (span * (1 + 1e-6 * fast[ids]) for ids in (flight.target, flight.initiator))
     carrier = sign * (PPM[flight.target] - PPM[flight.initiator])
@@ -395,7 +398,7 @@ def test_clocks_that_agree_or_of_which_readings_prove_nothing_are_left_alone(som
 
 
 def test_a_clock_that_only_the_stamps_find_fast_is_named_with_what_it_does():
-    # Tag 3 is 3 ppm slow; its stamps say 2 ppm fast.
+    # Tag 3 is 3 ppm slow; by its stamps it is 2 ppm fast.
     some = exchanges(stamps_ppm=(4.0, -3.0, 6.5))
     found = clocks_apart(some)
     assert found is not None

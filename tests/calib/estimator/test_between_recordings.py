@@ -1,4 +1,4 @@
-"""The variance of offsets that few and uncertain values show, and what it makes of ranges of other recordings."""
+"""The variance of offsets from few, uncertain values, and its effect on predicted errors of other recordings."""
 
 from dataclasses import replace
 
@@ -14,10 +14,10 @@ BOUNDS = (1e-4, 1.0)
 
 
 def sampled(information, slope, typical, rng):
-    """Return the mean of s^2 by weighing draws of s from its half-normal distribution with the likelihood of z."""
+    """Return the mean of s^2 by weighting draws of s from its half-normal prior with the likelihood of z."""
     deviation = np.abs(rng.normal(0, typical, 400_000))[:, None]
     spread = np.hypot(deviation, information**-0.5)
-    # The likeliest value of a draw is normal about zero with what it is drawn from and what is unknown of it.
+    # A value is normal about zero with the variance of its draw plus that of its uncertainty.
     weight = np.exp(-np.sum(np.log(spread) + 0.5 * (slope / information / spread) ** 2, axis=1))
     return float(np.sum(weight * deviation[:, 0] ** 2) / np.sum(weight))
 
@@ -28,7 +28,7 @@ def test_variance_is_the_mean_of_its_posterior(planted_m):
     information = rng.uniform(300, 3000, 8)
     values = rng.normal(0, np.hypot(planted_m, information**-0.5))
     found = mean_variance(information, values * information, 0.035, BOUNDS)
-    # Sampling leaves 1 % of the mean, the grid of 200 deviations less.
+    # Sampling has an error of 1 % of the mean, the grid of 200 deviations less.
     assert found == pytest.approx(sampled(information, values * information, 0.035, rng), rel=0.03)
 
 
@@ -47,7 +47,7 @@ def test_what_is_said_of_other_recordings_is_in_the_total_and_what_is_not_is_ref
     ranges = make(CLEAN["three tags"], 32).ranges[::3]
     plain, stated = (calib.fit(ranges, between_m=value).calibration for value in (0.0, 0.05))
     totals = [each.apply(ranges).sigma_total_m for each in (plain, stated)]
-    # No reflection, no outlier: squares add up, but for the factor on each pair's noise.
+    # Without reflections and outliers, squares add up, except for the factor on the noise of each pair.
     assert np.median(totals[1] ** 2 - totals[0] ** 2) == pytest.approx(0.05**2, rel=0.15)
     with pytest.raises(calib.BadInputError, match="between_m"):
         calib.fit(ranges, between_m=-1.0)
@@ -59,7 +59,7 @@ def test_quiet_and_noisy_pairs_differ_between_recordings_by_as_much():
     lifted = np.full(len(ranges), np.median(plain.errors.lifted))
     noise = [one.errors.shapes(lifted, ranges.initiator, ranges.target).noise_m for one in (plain, stated)]
     assert noise[0].max() > 1.5 * noise[0].min()
-    # Nodes of power stand for their median in the factors of pairs, which costs a few per cent.
+    # The factors of pairs use the median over the powers, which causes a few per cent.
     assert noise[1] ** 2 - noise[0] ** 2 == pytest.approx(np.full(len(ranges), 0.05**2), rel=0.1)
     assert stated.errors.within_m(noise[1]) == pytest.approx(noise[0], rel=0.1)
 
@@ -89,9 +89,9 @@ def starloc():
 @pytest.mark.parametrize(("one", "other"), [(0, 1), pytest.param(1, 0, marks=pytest.mark.slow)])
 def test_a_flight_predicts_the_errors_of_another_day(starloc, one, other):
     found = calib.fit(starloc[one]).calibration
-    # STAR-loc chose none of the model's constants.
+    # No constant of the model was chosen with STAR-loc.
     assert 0.92 < calib.evaluate(starloc[other], found).overall.inside_95 < 0.97
-    # The smallest delays: what both tags of the rig have more and all anchors less is not in the data.
+    # The minimum-norm delays: a shift of both tags of the rig against all anchors is not determined.
     of_tags = sum(found.delays_ns[tag] for tag in (1, 2))
     assert of_tags == pytest.approx(sum(found.delays_ns.values()) - of_tags, abs=0.01)
 
@@ -100,7 +100,7 @@ def test_a_flight_predicts_the_errors_of_another_day(starloc, one, other):
 def test_delays_of_150_ranges_of_a_real_flight_agree_with_those_of_all(starloc):
     whole = calib.fit(starloc[0]).calibration
     tags, scores = list(whole.delays_ns), []
-    # Nothing tells what both tags of the rig have more and all anchors less, nor what all have.
+    # A shift of both tags of the rig against all anchors, and a common shift of all, are not determined.
     free = np.array([np.ones(len(tags)), [1.0 if tag in (1, 2) else -1.0 for tag in tags]])
     known = np.linalg.svd(free)[2][2:]
     for seed in range(48):
@@ -108,5 +108,5 @@ def test_delays_of_150_ranges_of_a_real_flight_agree_with_those_of_all(starloc):
         part = calib.fit(starloc[0][rows]).calibration
         away = known @ [part.delays_ns[tag] - whole.delays_ns[tag] for tag in tags]
         scores.append(away @ np.linalg.solve(known @ np.array(part.uncertainty.delays_ns2) @ known.T, away))
-    # 384 squares of normal values: 95 % of such means lie below 1.12; a third more for what 150 ranges leave unknown.
+    # 384 squares of normal values: 95 % of such means are below 1.12; a third more for the uncertainty from 150 ranges.
     assert np.mean(scores) / len(known) < 1.5

@@ -1,4 +1,4 @@
-"""The estimator by what a contributor writes: an unknown, a part and a kind of row of one's own, and an oracle."""
+"""Extensions of the estimator by a contributor: an unknown, a part and a kind of row; and an oracle."""
 
 from dataclasses import replace
 from typing import Any
@@ -19,7 +19,9 @@ EXAMPLE = next(b.code for b in pages.blocks(pages.ROOT / "CONTRIBUTING.md") if "
 
 @pytest.fixture(scope="module")
 def climbed():
-    """A function that runs the example of CONTRIBUTING.md with a data sheet: the slope found, and its deviation."""
+    """Return a function that runs the example of CONTRIBUTING.md with a data sheet and returns the slope and its
+    deviation.
+    """
     cold = make(CLEAN["short, 30 s"], 12_001).ranges
 
     def temperature_at(time_ns):
@@ -47,7 +49,7 @@ def test_one_more_unknown_is_one_unknown_and_one_part(climbed):
 def test_one_more_kind_of_row_is_one_class(climbed):
     alone, std = climbed(0.0, 1e6)
     value, both = climbed(0.003, std)
-    # As well known from the sheet as from ranges: halfway, and better by the root of two.
+    # Sheet and ranges have equal weight: the result is halfway, and its deviation is smaller by the root of two.
     assert value == pytest.approx((alone + 0.003) / 2, abs=0.2 * std)
     assert both == pytest.approx(std / np.sqrt(2), rel=0.1)
 

@@ -1,4 +1,4 @@
-"""Errors of groups taken apart into noise, reflections and outliers, and what ranges tell on average by the model."""
+"""Errors of groups divided into noise, reflections and outliers, and the mean information of ranges by the model."""
 
 from dataclasses import replace
 
@@ -28,12 +28,12 @@ def mixed(n=40_000, share=0.12, mean_m=0.35, outlier=0.0, seed=3):
 )
 def test_the_parts_of_errors_are_found(planted):
     found = fit_grouped_errors(mixed(**planted))
-    # 20 000 errors know the centre to 0.6 and 1.2 mm and a sigma to 0.5 %; three times that are allowed.
+    # 20,000 errors determine the centre to 0.6 and 1.2 mm and a sigma to 0.5 %; three times that are allowed.
     np.testing.assert_allclose(found.centre_m, 0.03, atol=0.0035)
     np.testing.assert_allclose(found.sigma_m, [0.06, 0.12], rtol=0.02)
     share = planted.get("share", 0.12)
     np.testing.assert_allclose(found.reflected, share, atol=0.012 if "outlier" not in planted else 0.02)
-    # Planted ones lie over 80 m, those of the model over 10 m.
+    # Planted outliers are spread over 80 m, those of the model over 10 m.
     np.testing.assert_allclose(found.outliers, planted.get("outlier", 0.0), atol=0.012)
     if share and "outlier" not in planted:
         np.testing.assert_allclose(found.detour_m, planted.get("mean_m", 0.35), rtol=0.06)
@@ -52,7 +52,7 @@ VALUES = {"noise": np.log(0.04), "odds": -2.0, "detour": np.log(0.3), "least": n
 
 @pytest.mark.parametrize("spread_m", [0.03, pytest.param(100.0, marks=pytest.mark.slow)])
 def test_noise_is_that_of_restricted_likelihood_however_many_offsets_there_are(spread_m):
-    # Six ranges for each of 100 offsets; without a prior that is the pooled variance, else an analysis of variance.
+    # Six ranges for each of 100 offsets; without a prior this is the pooled variance, else an analysis of variance.
     rng = np.random.default_rng(4)
     offset, noise = 0.03 * rng.normal(size=(100, 1)), 0.05 * rng.normal(size=(100, 6))
     group, error = np.repeat(np.arange(100), 6), (offset + noise).ravel()
@@ -78,7 +78,7 @@ def test_noise_is_that_of_restricted_likelihood_however_many_offsets_there_are(s
     best = optimize.minimize_scalar(unlikely, bounds=(-5, -1), method="bounded").x
     assert found.of("noise")[0] == pytest.approx(best, abs=0.005)
     assert np.exp(best) == pytest.approx(0.05, rel=0.08)
-    # The joint likelihood has it smaller, by up to a tenth.
+    # The joint likelihood gives a smaller value, by up to a tenth.
     assert maximize([rows], Priors(layout), layout.start(), evidence_steps=0).of("noise")[0] < best - 0.03
 
 

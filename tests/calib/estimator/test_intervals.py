@@ -1,4 +1,4 @@
-"""What intervals of a fit are made of, part by part: how long errors last, small samples, reflections."""
+"""Parts of the intervals of a fit: persistence of errors, small samples, reflections."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -28,7 +28,8 @@ def test_what_a_fit_uses_of_the_data_is_given_back():
     cut = time_blocks(model.ranges.time_ns, model.ranges.session)
     kept = {"delay": Kept.delays(delays, 1e9, model.held)}
     whole, lasting = sandwich(Slopes(found.rows, found.optimum, cut), kept)["delay"]
-    # With NumPy alone: scores summed by block, the residual's share of degrees of freedom, and how long errors last.
+    # With NumPy alone: scores summed by block, the residual's share of the degrees of freedom, and the persistence of
+    # errors.
     tags, ranges = np.array(model.tags), model.ranges
     weights = ((ranges.initiator, ranges.weight_initiator), (ranges.target, ranges.weight_target))
     matrix = sum((ids[:, None] == tags) * weight[:, None] for ids, weight in weights) * 0.299702547
@@ -65,16 +66,16 @@ def test_intervals_of_few_ranges_hold():
         flat = replace(some, raw_m=some.raw_m - synthetic.bias_m(lifted(some)), time_ns=20 * some.time_ns)
         known = calib.fit(flat, loss="l2").calibration
         scores.append(np.divide(*synthetic.about_their_mean(known, synthetic.DELAYS_NS)))
-    # Twelve fits with three differences of delays each know a standard deviation to 12 %; persistence that is looked
-    # for, and not there, widens intervals of so few ranges by a fifth, and offsets of pairs, of which two more than
-    # delays tell little, by half.
+    # Twelve fits with three differences of delays each determine a standard deviation to 12 %. Testing for persistence
+    # that does not exist widens intervals of so few ranges by a fifth; offsets of pairs, of which there are two more
+    # than delays, by half.
     assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.25
 
 
 def test_times_in_microseconds_for_nanoseconds_do_not_narrow_intervals():
     some = synthetic.ranges(n=600)
     sound, hasty = (calib.fit(replace(some, time_ns=some.time_ns // factor)) for factor in (1, 1000))
-    # Thirty blocks know a variance to a quarter; one block, as three milliseconds were, left a third of the width.
+    # Thirty blocks determine a variance to a quarter; one block, as with three milliseconds, left a third of the width.
     widths = [np.mean(list(found.calibration.delays_std_ns.values())) for found in (sound, hasty)]
     assert widths[1] > 0.75 * widths[0]
     assert [said for said in hasty.warnings if "s of data" in said]
@@ -89,7 +90,7 @@ def blocks(count, seconds):
 
 
 def walk(keep, share, rng, blocks=800, columns=4):
-    """Noise of which a share remembers itself, with the factor that it puts on the variance of a mean."""
+    """Return noise of which a share is persistent, with the resulting factor on the variance of a mean."""
     memory = np.zeros((blocks, columns))
     memory[0] = rng.normal(size=columns)
     for k in range(1, blocks):
@@ -105,7 +106,7 @@ def test_the_factor_is_that_of_the_autocorrelation(keep, share):
     for _ in range(20):
         series, planted = walk(keep, share, rng)
         found.append(persistence(series, blocks(800, 240.0), 4).factor)
-    # Twenty draws know a factor of 40 to a tenth; where hardly twenty stretches are left it is rather too large.
+    # Twenty draws determine a factor of 40 to a tenth; with only twenty stretches it is slightly too large.
     assert 0.85 * planted < np.exp(np.mean(np.log(found))) < 1.4 * planted
 
 
@@ -124,12 +125,13 @@ def test_blocks_are_short_and_leave_gaps_out():
     assert set(np.diff(found.number).tolist()) <= {0, 1}
     assert found.number[999] < found.number[1000]
     assert found.seconds == pytest.approx(19.98)
-    # Blocks of a tenth of a second, however long the gap is.
+    # Blocks have a tenth of a second, however long the gap is.
     assert 199 <= found.count <= 202
 
 
 def test_the_delays_of_one_pair_are_known_as_well_as_its_constant():
-    # Of two tags only the sum of the delays is determined; their difference says nothing of how long errors last.
+    # Of two tags, only the sum of the delays is determined; their difference has no effect on the persistence of
+    # errors.
     ranges = make(Recipe(tags=2, seconds=120, per_second=20, lasts_s=3.0, share=(0.3, 0.3)), 20_004).ranges
     ranges = replace(ranges, weight_target=np.full(len(ranges), 0.5))
     tags, pair = (calib.fit(ranges, constants=kind).calibration for kind in ("tag", "pair"))
@@ -158,10 +160,10 @@ def test_offsets_of_few_pairs_widen_intervals_as_in_regression(count):
     seen = [one for one in result.calibration.provenance["warnings"] if "which the intervals do not include" in one]
     freedom = len(pairs) - count
     if not freedom:
-        # Of three tags an offset of 3.5 cm a pair is one of 3.5 cm * sqrt(3) / c in a delay.
+        # Of three tags, an offset of 3.5 cm per pair is one of 3.5 cm * sqrt(3) / c in a delay.
         assert "by up to 202 ps" in seen[0]
         return
-    # Means of pairs are a regression with delays as coefficients; their common part is the curve's constant.
+    # Means of pairs are a regression with delays as coefficients; their common part is the constant of the curve.
     rows = -0.5 * light * (pairs[:, :, None] == np.arange(count)).any(axis=1)
     means = np.bincount(pair, raw_m - true_m) / 300
     apart = np.eye(count) - 1 / count
@@ -169,7 +171,7 @@ def test_offsets_of_few_pairs_widen_intervals_as_in_regression(count):
     covariance = residuals @ residuals / freedom * np.linalg.inv(rows.T @ rows)
     half = student.ppf(0.975, freedom) * np.sqrt(np.diag(apart @ covariance @ apart))
     mine = apart @ result.calibration.covariance_ns2(range(1, count + 1)) @ apart
-    # What the noise of a mean, 1 mm, and the search leave.
+    # The noise of a mean, 1 mm, and the tolerance of the search.
     np.testing.assert_allclose(1.96 * np.sqrt(np.diag(mine)), half, rtol=0.03)
     assert not seen
 
@@ -185,6 +187,6 @@ def test_where_delays_are_stated_offsets_move_the_others():
         truth_m=true_m,
         time_ns=np.arange(600) * 50_000_000,
     )
-    # Tag 1 is known, so an offset of 3.5 cm is one of twice 3.5 cm / c in the other tag's delay.
+    # Tag 1 is known, so an offset of 3.5 cm is one of twice 3.5 cm / c in the delay of the other tag.
     (said,) = [one for one in calib.fit(ranges, fixed_ns={1: 0.0}).warnings if "the intervals do not include" in one]
     assert "by up to 234 ps" in said

@@ -1,4 +1,4 @@
-"""What listeners overhear, fitted beside ranges: by worlds of NumPy alone, and by the simulator without noise."""
+"""Overheard frames fitted together with ranges: worlds of NumPy alone, and the simulator without noise."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +24,7 @@ def fitted(data, use, **settings):
 
 
 def by_tag(found):
-    """Delays and their standard deviations (2, tags)."""
+    """Return delays and their standard deviations (2, tags)."""
     names = sorted(found.calibration.delays_ns)
     return np.array([[c[tag] for tag in names] for c in (found.calibration.delays_ns, found.calibration.delays_std_ns)])
 
@@ -36,11 +36,11 @@ def test_each_listener_alone_finds_each_targets_delay_without_noise():
     heard, target = ranges.arrivals, ranges.target[ranges.arrivals.exchange]
     several = {(tag, k) for tag, k in zip(target.tolist(), heard.listener.tolist(), strict=True)}
     assert len(several) == 20
-    # With the true distance in place of the range, whose errors contain both delays.
+    # With the true distance instead of the range, whose errors contain both delays.
     error_m = heard.error_m + (ranges.raw_m - ranges.truth_m)[heard.exchange]
     for tag, listener in several:
         own = error_m[(target == tag) & (heard.listener == listener)]
-        # Eight hundred differences and more of five rounded stamps, 8 ps each: 0.3 ps.
+        # At least 800 differences of five rounded stamps, 8 ps each: 0.3 ps.
         assert -np.mean(own) / METRES_A_NS == pytest.approx(found.planted["delays_ns"][str(tag)], abs=1.2e-3)
 
 
@@ -55,24 +55,24 @@ def test_listeners_gain_what_theory_predicts_and_intervals_hold():
         delays, std = fitted(data, "receptions", delays_only=True, loss="l2")
         beyond[seed], errors[seed] = delays - least_squares_ns(data), delays - planted
         inside[seed] = np.abs(delays - planted) < 1.96 * std
-    # Least squares reaches the bound, and what another estimator adds to it is independent: the fit's standard
-    # deviation is within 10 % of the bound, which the errors themselves would show to a tenth with 100 flights only.
+    # Least squares reaches the bound, and the additional error of another estimator is independent. So the standard
+    # deviation of the fit is within 10 % of the bound; errors alone would show this to a tenth only with 100 flights.
     assert np.sqrt(1 + np.mean(beyond**2) / bound**2) < 1.1
-    # 120 errors, of which 20 are independent if all delays of a flight err together: rms to 16 %.
+    # 120 errors, of which 20 are independent if all delays of a flight have common errors: rms to 16 %.
     assert np.sqrt(np.mean(errors**2)) < 1.16 * 1.1 * bound
     assert inside.mean() > 0.9
 
 
 @pytest.mark.slow
 def test_intervals_hold_among_reflections_with_a_curve():
-    """Contrasts of delays: a constant of the curve is theirs."""
+    """Contrasts of delays are compared, because a constant of the curve shifts all delays."""
     errors, stated = [], []
     for seed in range(10):
         data, planted = flight(7100 + seed, reflected=0.15, bias_m=0.1)
         delays, std = fitted(data, "receptions")
         errors += ((delays - planted) - np.mean(delays - planted)).tolist()
         stated += std.tolist()
-    # An interval of a delay holds the constant, too, so contrasts lie within it more often.
+    # An interval of a delay includes the constant, so contrasts are within it more often.
     assert np.mean(np.abs(errors) < 1.96 * np.array(stated)) > 0.9
     assert np.sqrt(np.mean(np.square(errors))) < 0.02
 
@@ -107,7 +107,7 @@ def test_recordings_are_fitted_together_with_what_each_overheard():
 def test_a_listener_that_stands_elsewhere_is_named():
     data, _ = flight(7400)
     heard = data.overheard
-    # Tag 9 only listens, where tag 2 is, and is said to stand there or 10 cm beside it.
+    # Tag 9 only listens, at the place of tag 2; its stated position is that, or 10 cm beside it.
     only = {name: column[heard["listener"] == 2] for name, column in heard.items()}
     joined = {name: np.concatenate([heard[name], only[name]]) for name in heard}
     joined["listener"] = np.append(heard["listener"], np.full(len(only["listener"]), 9))
@@ -139,7 +139,7 @@ def test_two_messages_take_the_rate_from_the_carrier():
     error_m = heard.error_m + (ranges.raw_m - ranges.truth_m)[heard.exchange]
     for tag in np.unique(target).tolist():
         delay_ns = -np.mean(error_m[target == tag]) / METRES_A_NS
-        # Carriers are read in steps of 0.0038 ppm at best; over a reply of 1.5 ms a thousandth is 1.5 ps.
+        # Carriers are read in steps of 0.0038 ppm at best; over a reply of 1.5 ms, a thousandth of a ppm is 1.5 ps.
         assert delay_ns == pytest.approx(found.planted["delays_ns"][str(tag)], abs=0.05)
 
 
@@ -170,11 +170,13 @@ def test_a_real_flight_has_narrower_intervals_and_the_same_delays(tmp_path):
     flown = read_source(miluv(tmp_path), importer="miluv")
     found = [calib.fit(flown, use=use, between_m=0.0) for use in ("exchanges", "receptions")]
     (delays, std), (heard, narrow) = map(by_tag, found)
-    # 317 ranges, and some 700 differences of arrival at the five other tags.
+    # 317 ranges, and about 700 differences of arrival at the five other tags.
     assert (narrow < 0.85 * std).all()
-    # What the receptions add is independent, so the change has the difference of both variances (Hausman 1978).
+    # The information of the receptions is independent, so the change has the difference of both variances (Hausman
+    # 1978).
     assert np.abs((heard - delays) / np.sqrt(std**2 - narrow**2)).max() < 3
-    # The doctor says what contradicts: two tags of one robot, a lever arm apart, hear each other's frames too early.
+    # The doctor names the contradiction: two tags of one robot, a lever arm apart, receive each other's frames too
+    # early.
     said = [w for w in found[1].warnings if "overheard" in w]
     assert all(w.startswith(("path 10-11", "path 20-21", "path 30-31")) for w in said), said
 

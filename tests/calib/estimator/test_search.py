@@ -1,4 +1,4 @@
-"""Sparse and dense linear algebra of the estimator give the same."""
+"""Sparse and dense linear algebra of the estimator give equal results."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_an_arrow_is_inverted_as_the_dense_matrix_is():
 
 @pytest.mark.parametrize("most", [0, 400])
 def test_a_search_ends_at_least_squares_and_finds_the_weight_of_its_prior(most, monkeypatch):
-    """A random walk of 200 steps of 0.5 m, seen with 0.1 m of noise."""
+    """A random walk of 200 steps of 0.5 m, measured with 0.1 m of noise."""
     for module in (rows, unknowns):
         monkeypatch.setattr(module, "MOST_DENSE", most)
     rng = np.random.default_rng(1)
@@ -49,7 +49,7 @@ def test_a_search_ends_at_least_squares_and_finds_the_weight_of_its_prior(most, 
     assert found.x == pytest.approx(np.linalg.solve(precision, seen / 0.01), abs=1e-4)
 
 
-# The end of a search: the same from wherever near it a search starts.
+# The end of a search is the same for different starts near it.
 
 
 @pytest.mark.parametrize(
@@ -70,10 +70,11 @@ def test_a_search_ends_at_one_optimum_of_unknowns_and_weights(data):
         rng = np.random.default_rng(seed)
         known = zip(optimum.priors.weights, optimum.priors.all, strict=True)
         weights = [w if prior.bounds is None else w * np.exp(rng.normal()) for w, (_, prior) in known]
-        # By a standard error each, logarithms by a half at most: farther away there may be other optima.
+        # Starts differ by a standard error, in logarithms by a half at most: farther away, there may be other optima.
         away = np.minimum(np.sqrt(np.diag(np.asarray(optimum.covariance))), 0.5) * rng.normal(size=len(optimum.x))
         again = maximize(rows, Priors(optimum.layout, weights), optimum.x + away, asked=asked)
         assert again.success
         assert again.steps < 25
-        # Searches end where a step promises 0.01 of log likelihood, a tenth of a standard error at most: both of two.
+        # A search ends if a step gains less than 0.01 in log likelihood, at most a tenth of a standard error, for both
+        # searches.
         assert np.abs((again.of("delay") - optimum.of("delay")) / std).max() < 0.2

@@ -1,10 +1,10 @@
-"""Flights of a robot among anchors whose delays drift, in plain NumPy; shares no code with filters and simulator."""
+"""Flights of a robot among anchors with drifting delays, in plain NumPy; shares no code with filters and simulator."""
 
 import numpy as np
 
 from uwblink import Contents, Exchanges, Poses, Tag
 
-LIGHT = 0.299702547  # metres a nanosecond, in air
+LIGHT = 0.299702547  # metres per nanosecond, in air
 PLACES = np.array([[0, 0, 2.6], [7, 0.4, 0.3], [6.6, 6, 2.4], [0.2, 5.7, 0.4], [3.5, -0.5, 1.8], [3.2, 6.4, 2.2]])
 ARMS = np.array([[0.17, 0.12, 0.05], [-0.16, -0.13, -0.08]])
 DELAYS_NS = {1: 0.31, 2: -0.22, 11: 0.05, 12: -0.3, 13: 0.14, 14: -0.07, 15: 0.22, 16: -0.12}
@@ -13,18 +13,19 @@ BODIES = ["robot", "robot", *(f"anchor{tag}" for tag in range(11, 17))]
 
 
 def place(time_s, seed):
-    """Places (n, 3) of the robot, which does not turn."""
+    """Return the positions (n, 3) of the robot, which does not turn."""
     phases = np.random.default_rng([seed, 7]).uniform(0, 6, 5)
     wave = np.sin(np.outer(time_s, [0.62, 0.53, 0.44, 1.4, 1.1]) + phases)
     return [3.4, 2.9, 1.3] + wave @ [[2.3, 0, 0], [0, 2.1, 0], [0, 0, 0.7], [0.3, 0, 0.1], [0, 0.3, 0]]
 
 
 def flight(seed, last_s=120.0, rate_hz=100, drift_m=None, only=None, offset_m=0.0):
-    """A recording, and the antenna's place (n, 3) that begins each exchange: of the robot, or one in five of an anchor.
+    """Return a recording, and the position (n, 3) of the initiator's antenna in each exchange: of the robot, or in one
+    of five, of an anchor.
 
-    Ranges have noise of 6 cm; a tenth is reflected, by 35 cm on average. Those of a tag drift linearly, by `drift_m` at
-    the end. `only` is the robot's tag that ranges, by default both and anchors. Ranges of a pair have a constant of
-    `offset_m` (standard deviation).
+    Ranges have noise of 6 cm; a tenth is reflected, by 35 cm on average. Ranges of a tag drift linearly, by `drift_m`
+    at the end. `only` is the tag of the robot that ranges, by default both and the anchors. Ranges of a pair have a
+    constant error with the standard deviation `offset_m`.
     """
     rng, count = np.random.default_rng(seed), int(last_s * rate_hz)
     time_s, rows = 1 + np.arange(count) / rate_hz, np.arange(count)

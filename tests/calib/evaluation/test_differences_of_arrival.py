@@ -1,4 +1,4 @@
-"""Differences of arrival: corrected as by hand, and a robot that never sends, localized among eight anchors."""
+"""Differences of arrival: corrections by hand, and localization of a robot that never sends, among eight anchors."""
 
 import itertools
 import json
@@ -19,7 +19,7 @@ from uwbsim import Scenario, simulate
 
 ANCHORS = [(-4.0, -3.5, 0.3), (4.0, -3.5, 2.8), (4.0, 3.5, 0.4), (-4.0, 3.5, 2.9), (0.0, -3.5, 2.6), (4.0, 0.0, 0.2),
            (0.0, 3.5, 2.4), (-4.0, 0.0, 0.5)]  # fmt: skip
-# Of the size that was measured: 0.3 ns of standard deviation.
+# As measured: a standard deviation of 0.3 ns.
 DELAYS_NS = {1: 0.31, 2: -0.42, 3: 0.12, 4: -0.25, 5: 0.48, 6: -0.06, 7: -0.33, 8: 0.22, 20: -0.4, 21: 0.15}
 ROBOT = (20, 21)
 BETWEEN_ANCHORS = list(itertools.combinations(range(1, 9), 2))
@@ -95,7 +95,8 @@ def test_one_row_is_that_of_a_page_of_numpy(known, heard):
     difference = metres * (second * final / third - reply) - range_m + delay_m[j]
     difference -= bias(lifted[0]) + bias(lifted[3]) - bias(lifted[2])
     assert found.corrected_m[mine][0] == pytest.approx(difference, abs=1e-5)
-    # A reception at i counts 1 + s and s in the range, as does one at k in the difference: with s = T12/T23.
+    # The error of a reception at i has the weights 1 + s and s in the range, as that at k in the difference: s =
+    # T12/T23.
     s = second / third
     twice = (1 + s) ** 2 + s**2
     one = 4 / (1 + twice)
@@ -108,7 +109,7 @@ def test_without_noise_it_is_the_true_difference_and_the_robot_is_where_it_is():
     silent = flight(3110, 5.0, radio={"quantize": False})
     ranges = calib.load_ranges(silent)
     wrong = PLANTED.correct_arrivals(ranges).corrected_m - ranges.arrivals.truth_m
-    # Stamps in whole ticks of 4.7 mm: each is off by 1.4 mm, and a difference has the errors of four or so.
+    # Stamps are whole ticks of 4.7 mm: each has an error of 1.4 mm, and a difference contains about four of them.
     assert abs(np.mean(wrong)) < 0.0005
     assert np.sqrt(np.mean(wrong**2)) < 0.004
     (found,) = calib.localize(silent, PLANTED, replace(LISTEN, velocity_std_mps=0.03, seeds=1))
@@ -125,7 +126,7 @@ def test_a_robot_that_never_sends_is_localized(known, heard):
     total = summarize(found)
     assert [one.body for one in found] == ["robot"] * 3
     assert max(total.rmse_m["variance"], total.rmse_m["robust"]) < 0.045 < 0.09 < total.rmse_m["raw"]
-    # 95 % of a chi-square over its degrees: three a value, over as many values as are independent.
+    # The 95 % quantile of a chi-square over its degrees: three per value, for the number of independent values.
     assert total.nees_bounds[0] < total.nees < total.nees_bounds[1]
     assert total.nees_bounds[1] - total.nees_bounds[0] < 1.0
     said = f"by 0 ranges and {3 * 6400} differences of arrival"
@@ -144,7 +145,8 @@ def test_the_filter_knows_what_listeners_of_an_exchange_share(heard):
         measured = {"variance": FilterRanges(true_m + drawn, std, shared, np.zeros_like(problem.sign))}
         tracks = run_filters(problem, measured, replace(LISTEN, gate=1e9))["variance"]
         means.append(float(np.mean([track.nees for track in tracks])))
-    # Taken for independent, two listeners count as two exchanges, and the filter believes them too much.
+    # If they were taken for independent, two listeners would count as two exchanges, and the filter would be
+    # overconfident.
     assert 2.5 < means[0] < 3.5
     assert means[1] > 1.3 * means[0]
 
@@ -174,7 +176,7 @@ def test_a_wrong_start_is_left_by_differences_alone(known):
 
 @pytest.mark.slow
 def test_what_is_overheard_helps_a_robot_that_ranges(known):
-    """Its tags hear the anchors, the anchors hear it, and each of its tags hears the other's exchanges."""
+    """Its tags hear the anchors, the anchors hear it, and each of its tags hears the exchanges of the other."""
     all_hear = flight(3120, 15.0, pairs="between-bodies", passive=DELAYS_NS)
     ((ranging,), (both,)) = (calib.localize(all_hear, known, Settings(use=use)) for use in ("exchanges", "receptions"))
     ranges = len(ranging.tracks["raw"].time_ns)
@@ -190,7 +192,7 @@ def test_what_is_overheard_helps_a_robot_that_ranges(known):
 
 @pytest.mark.slow
 def test_a_robot_on_board_is_helped_by_what_is_overheard(known, tmp_path):
-    """Its own tags, those that hear it and those that it hears, and one of its tags the exchanges of the other."""
+    """Overheard by its own tags, by tags that hear it and that it hears, and by one of its tags from the other."""
     flight(3121, 5.0, pairs="between-bodies", passive=DELAYS_NS).save(tmp_path / "robot.uwb")
     known.save(tmp_path / "c.json")
     found = []
@@ -200,13 +202,13 @@ def test_a_robot_on_board_is_helped_by_what_is_overheard(known, tmp_path):
         found.append(one)
     assert [one["used"] for one in found] == ["ranges", "ranges, differences of arrival"]
     assert found[1]["rmse_m"] < 0.9 * found[0]["rmse_m"]
-    # Lever arms count as unknown without a heading, which makes innovations less than stated.
+    # Lever arms are unknown without a heading, so innovations are smaller than stated.
     assert 0.7 < found[1]["nis"] < 1.1
 
 
 @pytest.mark.slow
 def test_reflections_that_last_and_pass_the_gate_are_counted():
-    """A gate of 3.3 standard deviations of a difference lets half a metre pass, with plus and with minus."""
+    """A gate of 3.3 standard deviations of a difference accepts errors of half a metre of both signs."""
     lasting = {"model": "two-state", "share": 0.14, "mean_excess_m": 0.35, "life_s": 0.15, "first_path_loss_db": 0.4,
                "loss_std_db": 1.0, "total_loss_db": 0.0}  # fmt: skip
     train, test = (
@@ -216,7 +218,8 @@ def test_reflections_that_last_and_pass_the_gate_are_counted():
     found = calib.localize(test, calib.fit(train), LISTEN)
     total = summarize(found)
     assert total.rmse_m["robust"] < 0.75 * total.rmse_m["raw"]
-    # Innovations are as stated to a tenth; with the noise of direct paths alone they are a third larger.
+    # Innovations agree with their stated size to a tenth; with the noise of direct paths alone they would be a third
+    # larger.
     assert 0.85 < total.nis < 1.15
     assert np.mean(found[0].tracks["robust"].nees) < 4.5
 

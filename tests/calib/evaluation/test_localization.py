@@ -1,4 +1,4 @@
-"""The EKF: consistent on clean ranges, better for a calibration, never locked out."""
+"""The EKF: consistent on clean ranges, more accurate with a calibration, and able to recover."""
 
 import tomllib
 from dataclasses import replace
@@ -46,7 +46,7 @@ def beginning(flight, seconds):
 
 
 def clean(flight: Flight, sigma_m=0.08) -> tuple[Flight, Calibration]:
-    """True distances with Gaussian noise and nothing else, and a calibration that says so."""
+    """Return true distances with Gaussian noise only, and a calibration that states it."""
     rng = np.random.default_rng(4)
     ranges = flight.ranges
     raw = ranges.truth_m + rng.normal(size=len(ranges)) * sigma_m
@@ -55,13 +55,13 @@ def clean(flight: Flight, sigma_m=0.08) -> tuple[Flight, Calibration]:
 
 
 def test_the_filter_is_consistent_on_clean_ranges(flights):
-    # Without a gate, which cuts the largest hundredth of NIS away.
+    # Without a gate, which rejects the largest hundredth of NIS.
     found = summarize(localize(*clean(flights["test1"]), Settings(gate=1e9, seeds=1)))
     assert found.nis_bounds[0] < found.nis < found.nis_bounds[1]
     assert found.nees_bounds[0] < found.nees < found.nees_bounds[1]
     assert found.nis_bounds[1] - found.nis_bounds[0] < 0.05
     assert found.nees_bounds[1] - found.nees_bounds[0] < 1.5
-    # Single values: 95 % lie within their own bounds, to the share that correlation leaves.
+    # Single values: 95 % are within their own bounds, up to the effect of correlation.
     assert found.nis_inside == pytest.approx(0.95, abs=0.01)
     assert found.nees_inside == pytest.approx(0.95, abs=0.03)
 
@@ -70,7 +70,7 @@ def test_a_body_that_ranges_only_where_its_place_is_unknown_is_left_out(flights)
     flight, known = clean(beginning(flights["test1"], 2))
     bodies = sorted({tag.body for tag in flight.tags})
     last = flights["test1"].ranges.time_ns.max()
-    # One body's poses come after all ranges.
+    # The poses of one body are later than all ranges.
     time = np.where(flight.poses.body == bodies[0], flight.poses.time_ns + last, flight.poses.time_ns)
     poses = replace(flight.poses, time_ns=time)[np.argsort(time, kind="stable")]
     assert {one.body for one in localize(replace(flight, poses=poses), known, Settings(seeds=1))} == set(bodies[1:])
@@ -101,11 +101,11 @@ def test_a_calibration_is_worth_at_least_a_third_of_the_error(flights, fitted):
     summary = summarize(found)
     assert summary.reduction["variance"] >= 0.4
     assert summary.rmse_m["raw"] > summary.rmse_m["calibrated"] > summary.rmse_m["variance"]
-    # The error model of reflections gains little in metres here, but it makes the filter consistent.
+    # The error model of reflections reduces the error little here, but makes the filter consistent.
     assert summary.rmse_m["robust"] < summary.rmse_m["variance"] * 1.02
     for name in ("variance", "robust"):
         assert 2.4 < np.mean(np.concatenate([one.tracks[name].nees for one in found])) < 3.6
-    # Without the duration of errors, the filter assumes independent ranges of a pair, and is overconfident.
+    # Without the persistence of errors, the filter assumes independent ranges of a pair, and is overconfident.
     forgetful = replace(fitted, errors=replace(fitted.errors, lasting=None))
     alone = summarize(localize(flight, forgetful, Settings(seeds=1)))
     assert alone.nees > 3.6
@@ -114,7 +114,7 @@ def test_a_calibration_is_worth_at_least_a_third_of_the_error(flights, fitted):
 
 
 def test_fixed_variances_are_those_of_the_training_flight(flights, fitted):
-    """Of noise of 8 cm values of the grid near it err least."""
+    """With noise of 8 cm, values of the grid near it have the smallest error."""
     flight, exact = clean(beginning(flights["test1"], 8))
     found = fixed_std(exact, Settings(seeds=1), flight)
     assert found.std_m["calibrated"] in (0.07, 0.1, 0.14)
@@ -124,7 +124,7 @@ def test_fixed_variances_are_those_of_the_training_flight(flights, fitted):
     assert known.std_m["raw"] == pytest.approx(np.std(errors))
     assert known.std_m["calibrated"] < known.std_m["raw"]
     assert fixed_std(fitted, Settings(fixed_std_m=0.3)).std_m == {"raw": 0.3, "calibrated": 0.3}
-    # Ranges whose truth nobody knows give the same: the flight itself has no say.
+    # Ranges without true distances give the same: the flight itself has no effect.
     assert localize(beginning(flight, 1), fitted, Settings(seeds=1))[0].fixed == known
 
 
@@ -158,15 +158,15 @@ def test_a_wrong_start_is_left_within_two_seconds(flights, fitted, offset):
 @pytest.mark.parametrize(("far_m", "offset"), [(3.0, (0.0, -10.0, 0.0)), (10.0, (0.0, 0.0, 5.0))])
 def test_wrong_ranges_do_not_lock_the_filter_out(flights, far_m, offset):
     flight, known = clean(beginning(flights["test1"], 12))
-    # Metres wrong, with a stated decimetre, and a start that no range agrees with: the gate refuses everything until
-    # the filter begins anew, first where the wrong ranges put it, then where the right ones do.
+    # The ranges are wrong by metres with a stated decimetre, and the start agrees with no range. The gate rejects all
+    # ranges until the filter restarts, first at the position of the wrong ranges, then at that of the right ones.
     early = flight.ranges.time_ns < flight.ranges.time_ns.min() + 2_000_000_000
     flight.ranges.raw_m[early] += far_m
     for one in localize(flight, known, Settings(seed=3, seeds=1, initial_offset_m=offset)):
         track = one.tracks["variance"]
         wrong = np.linalg.norm(track.estimate_m - track.truth_m, axis=1)
         wrong = wrong[track.time_ns > track.time_ns.min() + 4_000_000_000]
-        # Two seconds after the last wrong range it is back, and converges.
+        # Two seconds after the last wrong range it has recovered, and converges.
         assert wrong.max() < 1.0
         assert np.median(wrong) < 0.15
 
@@ -213,7 +213,7 @@ def test_bars_say_where_they_leave_bodies_out(flights, fitted):
     assert most.get_xlabel().startswith("5 of 6 bodies")
 
 
-# What a range tells a filter, against draws of noise, detours and outliers.
+# Information of a range for a filter, against draws of noise, detours and outliers.
 
 
 STD = 0.1
@@ -229,17 +229,17 @@ def draws(request):
     noise = rng.normal(0, STD, COUNT)
     kind = rng.random(COUNT)
     innovation = noise.copy()
-    # Of a difference of arrival either reception is reflected; where both are, one of the two counts.
+    # In a difference of arrival, either reception may be reflected; if both are, one of the two counts.
     shares = np.atleast_1d(errors.share)
     ends = 0.98 * np.append(0, np.cumsum(shares) / shares.sum() * (1 - np.prod(1 - shares)))
     for sign, begin, end, detour in zip((1, -1), ends, ends[1:], np.atleast_1d(errors.detour_m), strict=False):
         reflected = (kind >= begin) & (kind < end)
         innovation[reflected] += sign * (0.05 + rng.exponential(detour, np.count_nonzero(reflected)))
-        # By a lasting detour an innovation says nothing of the noise.
+        # If the detour lasts, the innovation has no information on the noise.
         lasting = kind < begin + (end - begin) * np.max(errors.known / errors.share)
         noise[reflected & lasting] = rng.normal(0, STD, np.count_nonzero(reflected & lasting))
     wild = kind > 0.98
-    # An outlier's innovation has the filter's own uncertainty in it, and says nothing of the noise.
+    # The innovation of an outlier contains the uncertainty of the filter, and has no information on the noise.
     innovation[wild] = np.hypot(2.0, STD) * rng.normal(size=np.count_nonzero(wild))
     return errors, innovation, noise, wild
 
@@ -251,7 +251,7 @@ def test_mean_and_variance_of_the_noise_are_those_of_draws(draws, value):
     update = mixture_update(np.array([value]), np.array([STD**2]), errors)
     count = np.count_nonzero(near)
     spread = noise[near].std()
-    # Four standard errors, and what the width of the bin does.
+    # Four standard errors, and the effect of the bin width.
     assert update.noise_m[0] == pytest.approx(noise[near].mean(), abs=4 * spread / np.sqrt(count) + 0.004)
     assert update.variance_m2[0] == pytest.approx(noise[near].var(), rel=6 / np.sqrt(count) + 0.05, abs=1e-4)
     assert update.believed[0] == (np.mean(wild[near]) < 0.5)
@@ -273,7 +273,7 @@ def test_a_gate_takes_all_or_nothing():
 
 
 def test_what_is_known_of_reflections_is_that_of_all_their_histories():
-    """Against a sum over every history of a renewal process, with densities by SciPy."""
+    """Compared with a sum over all histories of a renewal process, with densities by SciPy."""
     share, renewal_s, steps_s = 0.3, 0.5, np.array([0.0, 0.1, 0.05, 0.6, 0.02])
     innovation = np.array([0.05, 0.4, 0.9, 0.02, 0.25])
     direct, wild = norm(0, STD).pdf(innovation), 0.02 * norm(0, np.hypot(2.0, STD)).pdf(innovation)
@@ -296,9 +296,9 @@ def test_what_is_known_of_reflections_is_that_of_all_their_histories():
 
 @pytest.mark.slow
 def test_reflections_that_last_do_not_lead_the_filter_astray():
-    """Between metal racks half of a body's ranges are metres too long, for seconds on end; 3 is right.
+    """Between metal racks, half of the ranges of a body are metres too long, for seconds on end; 3 is right.
 
-    A filter that takes ranges of a pair for independent has a NEES of 24 here, and an error of 20 cm.
+    A filter that assumes independent ranges of a pair has a NEES of 24 here, and an error of 20 cm.
     """
     table = tomllib.loads((ROOT / "scenarios/hall_with_metal/hall.toml").read_text())
     first, second = (

@@ -1,4 +1,4 @@
-"""Localization by what is on board: flights written down as formulas, whose readings share no code with the filter."""
+"""Localization on board: flights as formulas, whose readings share no code with the filter."""
 
 from dataclasses import replace
 
@@ -27,32 +27,32 @@ BIASES = np.array([0.004, -0.006, 0.003]), np.array([0.15, -0.1, 0.08])
 
 
 def place(t):
-    """Where the body is: sums of sines, as fast as a careful drone."""
+    """Return the position of the body: sums of sines, with the speed of a careful drone."""
     return np.stack(
         [1.5 * np.sin(0.5 * t) + 0.3 * np.sin(1.3 * t), 1.3 * np.cos(0.4 * t), 1.4 + 0.4 * np.sin(0.7 * t)], axis=-1
     )
 
 
 def attitude(t):
-    """How it is turned: heading all around, and a tilt."""
+    """Return the attitude: a heading over all directions, and a tilt."""
     angles = np.stack([0.6 * t + 1.0, 0.1 * np.sin(0.9 * t), 0.08 * np.cos(1.1 * t)], axis=-1)
     return Rotation.from_euler("ZYX", angles)
 
 
 def turning(t):
-    """Angular velocity in the axes of the body, from attitudes a hundredth of a millisecond apart."""
+    """Return the angular velocity in the frame of the body, from attitudes a hundredth of a millisecond apart."""
     return (attitude(t - 5e-6).inv() * attitude(t + 5e-6)).as_rotvec() / 1e-5
 
 
 def pull(t):
-    """Specific force in the axes of the body, from second differences of the place."""
+    """Return the specific force in the frame of the body, from second differences of the position."""
     step = 1e-3
     acceleration = (place(t + step) - 2 * place(t) + place(t - step)) / step**2
     return attitude(t).inv().apply(acceleration + np.array([0, 0, 9.81]))
 
 
 def flight(seconds=20.0, seed=1, reflected=0.0, rate=50.0, start=0.0):
-    """A flight among anchors with inertial readings at 100 Hz and heights at 10, with the noise of `IMU`."""
+    """Return a flight among anchors with inertial readings at 100 Hz and heights at 10 Hz, with the noise of `IMU`."""
     rng = np.random.default_rng(seed)
     t = start + np.arange(0, seconds, 1 / rate)
     tag = np.where(np.arange(len(t)) % 2, 10, 11)
@@ -63,10 +63,10 @@ def flight(seconds=20.0, seed=1, reflected=0.0, rate=50.0, start=0.0):
     ns = 10**12
     power = np.full((2, len(t)), -85.0)
     ends = np.column_stack([tag, anchor])
-    ends[::3] = ends[::3, ::-1]  # some that the anchor initiates
+    ends[::3] = ends[::3, ::-1]  # some are initiated by the anchor
     exchanges = stamped((t * 1e9).astype(np.int64) + ns, ends, measured, power)
     ti = start + np.arange(-1.0, seconds + 1, 0.01)
-    # White noise of a density d in readings 10 ms apart has the standard deviation d / sqrt(10 ms).
+    # White noise of the density d in readings 10 ms apart has the standard deviation d / sqrt(10 ms).
     gyro = turning(ti) + BIASES[0] + rng.normal(size=(len(ti), 3)) * IMU.gyro / 0.1
     force = pull(ti) + BIASES[1] + rng.normal(size=(len(ti), 3)) * IMU.force / 0.1
     columns = dict(zip(("wx", "wy", "wz", "ax", "ay", "az"), np.hstack([gyro, force]).T, strict=True))
@@ -91,9 +91,10 @@ def flight(seconds=20.0, seed=1, reflected=0.0, rate=50.0, start=0.0):
 
 
 def listening(seconds=20.0, seed=1, rate=50.0):
-    """The same flight, in which anchors range with each other and the body's tags only listen: stamps by formulas.
+    """Return the same flight, in which anchors range with each other and the tags of the body only listen: stamps by
+    formulas.
 
-    Receptions have independent noise of such a size that ranges have `NOISE_M`, and clocks have rates of their own.
+    Receptions have independent noise such that ranges have `NOISE_M`, and clocks have different rates.
     """
     c, tick, reply, third = 299702547.0, 1 / (128 * 499.2e6), 0.4e-3, 1.5e-3
     rng, found = np.random.default_rng(seed), flight(seconds, seed, rate=rate)
@@ -157,7 +158,7 @@ def test_imu_height_and_ranges_find_place_and_heading():
     assert track.rmse_m == pytest.approx(np.sqrt(np.mean(errors_of(track) ** 2)))
     t = (track.time_ns - 10**12) * 1e-9
     off = (attitude(t).inv() * Rotation.from_quat(track.attitude)).magnitude()
-    # Headings begin all around; turns and accelerations tell.
+    # Headings start in all directions; turns and accelerations determine them.
     assert np.degrees(off[t > 10].max()) < 6
     assert track.restarts_s == ()
 
@@ -166,9 +167,9 @@ def test_imu_height_and_ranges_find_place_and_heading():
 def test_it_knows_how_good_it_is(seed):
     (track,) = localize_onboard(flight(seed=seed), calibration(), OnboardSettings(noise=IMU))
     late = track.time_ns > track.time_ns[0] + 5_000_000_000
-    # Errors of the state last for a second: fifteen independent values of three, known to 15 % each way.
+    # Errors of the state last for a second: fifteen independent values of three, whose mean square is known to 15 %.
     assert 1.5 < np.mean(track.nees[late]) < 5.0
-    # The stated error has the size of the true one, in metres, to the same part.
+    # The stated error has the size of the true error, in metres, within the same share.
     assert np.sqrt(np.mean((errors_of(track) / track.std_m)[late] ** 2)) == pytest.approx(1.0, abs=0.35)
     settled = track.range_time_ns > track.time_ns[0] + 5_000_000_000
     assert np.mean(track.nis[settled]) == pytest.approx(1.0, abs=0.17)
@@ -193,7 +194,7 @@ def test_a_velocity_that_lasts_does_without_an_imu():
     settings = OnboardSettings(model="constant-velocity")
     (track,) = localize_onboard(replace(contents, imu={}), calibration(0.1), settings)
     assert track.used == "ranges, height"
-    # Lever arms of 21 cm point anywhere without a heading.
+    # Without a heading, lever arms of 21 cm have any direction.
     assert np.sqrt(np.mean(errors_of(track, 2.0) ** 2)) < 0.25
     (blind,) = localize_onboard(replace(contents, imu={}, height={}), calibration(0.1), settings)
     assert blind.used == "ranges"
@@ -217,13 +218,14 @@ def test_no_truth_is_needed(tmp_path):
     truth = np.loadtxt(tmp_path / "both" / "memory-drone-imu-truth.tum")
     t = (known.time_ns - 10**12) * 1e-9
     np.testing.assert_allclose(truth[:, 1:4], place(t), atol=1e-3)
-    # Attitudes are those of the nearest pose, 5 ms away at most.
+    # Attitudes are those of the nearest pose, at most 5 ms away.
     assert (attitude(t).inv() * Rotation.from_quat(truth[:, 4:])).magnitude().max() < 0.005
 
 
 def with_patterns(found, size_m):
-    """Return a flight whose anchors are turned and whose antennas at the robot and at anchor 2 delay by direction, and
-    the calibration that knows it: `size_m` to the front, as much less to the back."""
+    """Return a flight in which anchors are rotated and antennas of the robot and of anchor 2 depend on direction, and
+    the calibration with that pattern: `size_m` to the front, and the opposite to the back.
+    """
     turned = Rotation.from_euler("ZYX", [1.2, 0.2, -0.1])
     poses, x = found.poses, found.exchanges
     quaternion = np.where((poses.body == "anchor2")[:, None], turned.as_quat(), poses.quaternion)
@@ -252,7 +254,7 @@ def test_patterns_are_corrected_by_the_estimated_pose():
     errors = [np.sqrt(np.mean(errors_of(one, 5.0) ** 2)) for one in (free, corrected, wrong)]
     assert errors[1] < 1.2 * errors[0]
     assert errors[1] < 0.5 * errors[2]
-    # Poses of the body serve as truth alone: without them the estimate is the same.
+    # Poses of the body are only used as truth: without them the estimate is the same.
     (alone,) = localize_onboard(replace(turned, poses=turned.poses[turned.poses.body != "drone"]), known)
     np.testing.assert_array_equal(alone.estimate_m, corrected.estimate_m)
 
@@ -300,7 +302,7 @@ def test_a_body_that_only_listens_knows_where_it_is_and_how_well(seed):
     assert track.used == "differences of arrival, imu, height"
     assert len(track.nis) > 1980, "all 2000 differences but those of the start"
     late = track.time_ns > track.time_ns[0] + 5_000_000_000
-    # Fifteen independent values of three, as in `test_it_knows_how_good_it_is`.
+    # Fifteen independent values of three, as above.
     assert 1.5 < np.mean(track.nees[late]) < 5.0
     settled = track.range_time_ns > track.time_ns[0] + 5_000_000_000
     # Two listeners of an exchange have one error in common: the mean of 1500 squares is known to a twentieth.
@@ -329,13 +331,13 @@ def test_multilateration_is_exact_and_leaves_a_reflection_out():
     twice, reflected = np.tile(ANCHORS, (2, 1)), np.tile(exact, 2)
     reflected[[2, 9]] += 3.0, 0.8
     assert np.linalg.norm(multilaterate(reflected, twice, 0.0).place_m - true) < 0.15
-    # Three anchors leave two mirrored places, between which a height decides.
+    # Three anchors leave two mirrored positions, between which a height decides.
     assert multilaterate(exact[:3], ANCHORS[:3] * [1, 1, 0] + [0, 0, 1.0], 0.0, 1.9).place_m[2] > 1.0
 
 
 @pytest.mark.slow
 def test_a_real_flight_by_imu_height_and_ranges_alone(tmp_path):
-    """The dataset's own flight among obstacles: a range to an anchor in 1.2 s, gaps of 6 s, published calibration."""
+    """The flight of the data set among obstacles: a range to an anchor every 1.2 s, gaps of 6 s, published delays."""
     contents = read_source(miluv(tmp_path), importer="miluv")
     tracks = localize_onboard(contents, read_miluv(shared("miluv_published_calibration.json")))
     rmse = {track.body: track.rmse_m for track in tracks}

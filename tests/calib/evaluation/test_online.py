@@ -1,4 +1,4 @@
-"""Delays as states: drifts are followed, and cost little where there are none; factors have the filter's optimum."""
+"""Delays as states follow drifts, and cost little without drifts; factors have the optimum of the filter."""
 
 import json
 import re
@@ -19,19 +19,20 @@ from tests.calib.evaluation.drifting_flight import DELAYS_NS, LIGHT, PLACES, fli
 from tests.processes import refuse, succeed
 from tests.shared_data import ROOT
 
-# Over 10 K, the largest coefficient that users report (2 cm/K) for one tag, and the manual's 2.15 mm/K for all others.
+# Over 10 K: the largest coefficient that users report (2 cm/K) for one tag, and 2.15 mm/K of the manual for all others.
 DRIFT_M = dict.fromkeys(DELAYS_NS, 0.0215) | {1: 0.2}
 NO_GTSAM = "GTSAM is not installed here: pip install 'uwbcal[gtsam]'"
 
 
 @pytest.fixture(scope="module")
 def known():
-    # Nothing differs between flights: the robust filter has no constants of pairs, which would follow drifts, too.
+    # No errors differ between flights: otherwise the robust filter has constants of pairs, which would follow drifts,
+    # too.
     return fit(flight(100, 60.0)[0], between_m=0.0).calibration
 
 
 def wrong_m(delays_ns, drift_m):
-    """Errors (anchors,) of ranges of tag 1 to the anchors at the end, by estimated delays."""
+    """Return the errors (anchors,) of ranges of tag 1 to the anchors at the end, with estimated delays."""
     off = {tag: ns - DELAYS_NS[tag] + 2 * drift_m.get(tag, 0.0) / LIGHT for tag, ns in delays_ns.items()}
     return np.array([LIGHT / 2 * (off[1] + off[tag]) for tag in range(11, 17)])
 
@@ -72,7 +73,7 @@ def test_residuals_are_those_of_the_likelihood(known):
     best = one.weigh(np.linspace(-0.05, 0.05, 2001)).log_density.max()
     np.testing.assert_allclose(residual**2 / 2, best - many.weigh(around).log_density, atol=1e-6)
     assert np.all(np.diff(residual) > 0)
-    # Outliers tell nothing: their slope is left out, where they are likely.
+    # Outliers have no information: their slope is not compared where they are likely.
     inside = many.weigh(around).believed
     further = (many.whiten(around + 1e-6)[0] - many.whiten(around - 1e-6)[0]) / 2e-6
     np.testing.assert_allclose(slope[inside], further[inside], rtol=0.02, atol=1e-3)
@@ -88,8 +89,8 @@ def test_a_drift_of_2_cm_a_kelvin_over_10_kelvin_is_followed(known):
         assert one.tracks["online"].rmse_m < 0.8 * one.tracks["robust"].rmse_m
         assert np.abs(wrong_m({tag: delay for tag, (delay, _) in one.delays.items()}, DRIFT_M)).max() < 0.03
     nees, (low, high), _ = consistency([one.tracks["online"] for one in found])
-    # No more than the 95 % bound of a filter that is right. Below, the bound of 99 % (1.31 times as far away): the walk
-    # is a little too wide for one drifting tag, so that two of a robot do not make the filter overconfident.
+    # At most the 95 % bound of a consistent filter. Below, the bound of 99 % (1.31 times as far away): the walk is
+    # slightly too wide for one drifting tag, so that two tags of a robot do not make the filter overconfident.
     assert 3 - 1.31 * (3 - low) < nees < high < low + 0.5
     assert consistency([one.tracks["robust"] for one in found])[0] > 5
 
@@ -98,7 +99,7 @@ def test_a_drift_of_2_cm_a_kelvin_over_10_kelvin_is_followed(known):
 def test_where_nothing_drifts_the_filter_is_as_good_as_with_fixed_delays(known):
     found = [localize(flight(k)[0], known, Settings(seeds=1, online=True))[0] for k in (4, 5, 6)]
     online, fixed = (np.mean([one.tracks[name].rmse_m for one in found]) for name in ("online", "robust"))
-    # A walk that is assumed and is not there costs 2 to 5 %; that it is less likely shows within seconds.
+    # The cost of a walk that does not exist is 2 to 5 %; its lower likelihood is noticed within seconds.
     assert online < 1.005 * fixed
     assert np.mean([one.tracks["online"].drifts.mean() for one in found]) < 0.3
 
@@ -131,7 +132,9 @@ def test_without_motion_capture_drifting_delays_cost_nothing_and_are_followed(kn
 
 
 def smoothed(ranges, known, anchors_m, moves_m, std_m):
-    """Positions and changes of delays (n, 3 + tags) at ranges, and deviations at the end: the filter forth and back."""
+    """Return positions and changes of delays (n, 3 + tags) at ranges, and deviations at the end: the filter run forward
+    and back.
+    """
     states, updates = DelayStates.of(known, ranges.tags()), RangeUpdate.of(known, ranges)
     slopes = states.slopes(updates.ends, updates.delay_slopes)
     spread = np.zeros((len(ranges), 3 + len(states.tags)))
@@ -140,7 +143,7 @@ def smoothed(ranges, known, anchors_m, moves_m, std_m):
     moves[:, :3], latest = moves_m, np.full_like(spread, np.inf)
     while np.abs(found - latest).max() > 1e-6:
         innovation, along = updates.innovation(found[:, :3], np.array([anchors_m[tag] for tag in ranges.target]))
-        # Expectation maximisation: what weighing takes for noise is left to explain.
+        # Expectation maximisation: the noise estimated by weighting is left in the residual.
         noise_m = updates.weigh(innovation - np.sum(slopes * found[:, 3:], axis=1)).noise_m
         running, before, after = (
             GaussianFilters(np.zeros((1, len(spread[0]))), np.zeros((1, *[len(spread[0])] * 2)), 99),

@@ -1,4 +1,4 @@
-"""What differs between flights by pair: filters follow constants of pairs where a flight has them."""
+"""Errors of pairs that differ between flights: filters follow constants of pairs."""
 
 import json
 import re
@@ -31,7 +31,7 @@ def known():
 
 
 def without(known):
-    """The calibration with errors that are the same in all flights."""
+    """The calibration with errors that are equal in all flights."""
     errors = known.errors
     return replace(known, errors=replace(errors, noise_m=tuple(errors.within_m(np.array(errors.noise_m))), between_m=0))
 
@@ -44,11 +44,11 @@ def robust(contents, known) -> Track:
 def test_constants_of_pairs_are_followed(known):
     flights = [flight(seed, 40.0, offset_m=OFFSET_M)[0] for seed in (21, 22, 23, 24)]
     own, fixed = ([robust(one, by) for one in flights] for by in (known, without(known)))
-    # One prior for both: 14 constants are found from 40 s of ranges to about 2 cm.
+    # One prior for both: 14 constants are determined from 40 s of ranges to about 2 cm.
     assert np.mean([one.rmse_m for one in own]) < 0.75 * np.mean([one.rmse_m for one in fixed])
     assert min(one.offsets[-1] for one in own) > 0.99
     nees, (low, high), _ = consistency(own)
-    # Within the bounds of a filter that is right, at 99 %: 1.31 times as far away as those at 95 %.
+    # Within the 99 % bounds of a consistent filter: 1.31 times as far away as those of 95 %.
     assert 3 - 1.31 * (3 - low) < nees < 3 + 1.31 * (high - 3)
     assert consistency(fixed)[0] > 6
 
@@ -89,7 +89,7 @@ def test_the_average_over_models_has_the_moments_of_their_mixture():
     draws = states[which, 0] + np.einsum("nij,nj->ni", roots[which, 0], rng.normal(size=(len(which), 2)))
     np.testing.assert_allclose(means[:, 0], [states[0, 0], draws.mean(axis=0)], atol=0.01)
     np.testing.assert_allclose(covariances[1, 0], np.cov(draws.T), atol=0.03)
-    # No model is lost: it can be the likeliest again.
+    # All models keep a probability, so each can become the most likely one.
     for _ in range(40):
         average.learn(densities[1])
     assert average.weights[1, 2, 0] == pytest.approx(1e-3, rel=0.01)

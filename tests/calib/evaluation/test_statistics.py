@@ -1,4 +1,4 @@
-"""Statistics by pair and overall, against their definitions."""
+"""Statistics by pair and overall, compared with their definitions."""
 
 from dataclasses import replace
 
@@ -53,7 +53,7 @@ def test_the_planted_calibration_is_found_beside():
     calibration = calib.fit(r).calibration
     found = evaluate(r, calibration).planted
     assert sum(found.delay_error_ns.values()) == pytest.approx(0, abs=1e-12)
-    # A delay and a constant of the curve exchanged change nothing here.
+    # A shift of the delays and a constant of the curve cancel here.
     moved = replace(
         calibration,
         delays_ns={t: d + 0.2 for t, d in calibration.delays_ns.items()},
@@ -65,7 +65,7 @@ def test_the_planted_calibration_is_found_beside():
     again = evaluate(r, moved).planted
     assert again.curve_rms_m == pytest.approx(found.curve_rms_m, abs=1e-9)
     assert again.correction_rms_m == pytest.approx(found.correction_rms_m, abs=1e-6)
-    # The whole correction, by hand: what is left of raw minus truth when noise and tail are taken away.
+    # The whole correction, by hand: raw minus truth without noise and tail.
     applied = calibration.apply(r)
     clean = r.truth_m + bias_m(applied.lifted)
     for tag, delay in DELAYS_NS.items():
@@ -117,7 +117,7 @@ def test_one_more_column_is_one_row(monkeypatch):
     assert rows[-1].endswith(f" {found.overall.full.abs95_m:.3f}")
 
 
-# A fit judged on a part of its own ranges, which a second fit has not seen.
+# A fit evaluated on held-out ranges, which a second fit did not use.
 
 
 def test_a_part_that_is_held_out_judges_a_fit_to_the_others():
@@ -134,7 +134,7 @@ def test_a_part_that_is_held_out_judges_a_fit_to_the_others():
 
 
 def test_what_is_held_out_was_not_fitted():
-    """A constant of 20 cm in the last tenth of the time is seen whole by a fit that did not have it."""
+    """A constant of 20 cm in the last tenth of the time is fully visible to a fit without that tenth."""
     flight = calib.load_ranges(calib.sample_flight(3000))
     late = flight.time_ns > np.quantile(flight.time_ns, 0.9)
     moved = calib.Ranges.from_arrays(
@@ -151,7 +151,7 @@ def test_what_is_held_out_was_not_fitted():
         ({"hold_out": 1.0}, calib.BadInputError),
         ({"hold_out": float("nan")}, calib.BadInputError),
         ({"hold_out": 0.3, "fold": "week"}, calib.BadInputError),
-        ({"hold_out": 0.3, "fold": "session"}, calib.UnanswerableError),  # there is one
+        ({"hold_out": 0.3, "fold": "session"}, calib.UnanswerableError),  # it has one session
     ],
 )
 def test_settings_that_hold_nothing_out(changes, error):
@@ -159,7 +159,7 @@ def test_settings_that_hold_nothing_out(changes, error):
         calib.fit(calib.sample_flight(), **changes)
 
 
-# Whoever judges a calibration on what it was fitted to is told so.
+# Evaluating a calibration on its fitted recording gives a warning.
 
 
 def test_the_recording_is_known_by_what_it_holds_and_not_by_its_name(tmp_path):

@@ -1,5 +1,6 @@
-"""Relative poses of a team: worlds written down as formulas and a batch of least squares, which share no code with the
-filter, and simulated flights with seeds chosen before looking."""
+"""Relative poses of a team: worlds as formulas and a batch of least squares, which share no code with the filter, and
+simulated flights with seeds that were chosen before.
+"""
 
 import json
 from dataclasses import replace
@@ -32,7 +33,7 @@ EXACT = ProcessNoise(force=1e-9, gyro=1e-9, force_bias=0.0, gyro_bias=0.0, force
 
 
 def place(robot, t):
-    """Where a robot is: each on its own sum of sines, three metres from the others."""
+    """Return the position of a robot: its own sum of sines, three metres from the others."""
     way = [np.sin(0.9 * t + robot), np.cos((0.7 + 0.1 * robot) * t), 0.5 * np.sin(1.1 * t + 2 * robot)]
     return np.array([[0.0, 0.0, 1.0], [3.0, 0.5, 1.6], [1.2, 2.8, 0.7]])[robot] + 0.7 * np.stack(way, axis=-1)
 
@@ -43,7 +44,7 @@ def attitude(robot, t):
 
 
 def readings(robot, t):
-    """Angular velocity and specific force in the axes of the robot, by differences of attitudes and places."""
+    """Return angular velocity and specific force in the frame of the robot, by differences of attitudes and places."""
     turning = (attitude(robot, t - 5e-6).inv() * attitude(robot, t + 5e-6)).as_rotvec() / 1e-5
     bend = (place(robot, t + 1e-3) - 2 * place(robot, t) + place(robot, t - 1e-3)) / 1e-6
     return np.hstack([turning, attitude(robot, t).inv().apply(bend + np.array([0.0, 0.0, 9.81]))])
@@ -55,7 +56,7 @@ def antenna(tag, t):
 
 
 def relative(robot, t):
-    """Pose in the frame of robot a: positions and rotations."""
+    """Return the pose in the frame of robot a: positions and rotations."""
     frame = attitude(0, t).inv()
     return frame.apply(place(robot, t) - place(0, t)), frame * attitude(robot, t)
 
@@ -65,7 +66,7 @@ def biases(seed, size=1.0):
 
 
 def ranging(seconds, seed, rate=60.0):
-    """Times, pairs of tags of different robots, and ranges with white noise."""
+    """Return times, pairs of tags of different robots, and ranges with white noise."""
     rng, t = np.random.default_rng(seed), np.arange(0.0, seconds, 1 / rate)
     pairs = np.array([(i, j) for i in ARMS for j in ARMS if (i - 1) // 2 != (j - 1) // 2])
     ends = pairs[rng.integers(0, len(pairs), len(t))]
@@ -74,7 +75,7 @@ def ranging(seconds, seed, rate=60.0):
 
 
 def flight(seconds=4.0, seed=1, bias=1.0, **changes):
-    """A recording of three robots without anchors, whose IMUs have constant biases and no noise."""
+    """Return a recording of three robots without anchors, whose IMUs have constant biases and no noise."""
     t, ends, measured = ranging(seconds, seed)
     ti = np.arange(-0.05, seconds + 0.3, 1 / RATE_HZ)
     rows = [readings(robot, ti) + biases(seed, bias)[robot] for robot in range(3)]
@@ -109,11 +110,11 @@ def test_without_errors_dead_reckoning_is_the_relative_motion():
     for robot, one in enumerate(found, 1):
         track = one.tracks["dead reckoning"]
         where, turned = relative(robot, (track.time_ns - NS) * 1e-9)
-        # Readings are linear between two of them, 10 ms apart; the start's velocity is that of poses 0.1 s apart.
+        # Readings are linear between two of them, 10 ms apart; the start velocity is from poses 0.1 s apart.
         assert np.abs(track.estimate_m - where).max() < 0.03
         assert (Rotation.from_quat(track.attitude).inv() * turned).magnitude().max() < 5e-4
         np.testing.assert_allclose(track.truth_m, where, atol=1e-4)
-    # Another frame: poses of a in that of c are the inverses.
+    # Another frame: poses of a in the frame of c are the inverses.
     back = {one.body: one for one in calib.localize_team(flight(bias=0.0), PLANTED, replace(exact, reference="c"))}
     here, there = back["a"].tracks["dead reckoning"], found[1].tracks["dead reckoning"]
     undone = -Rotation.from_quat(there.attitude).inv().apply(there.estimate_m)
@@ -123,7 +124,7 @@ def test_without_errors_dead_reckoning_is_the_relative_motion():
 def batch(contents, t, ends, measured, start):
     """Return the relative poses at the last range by least squares of all ranges, and standard deviations.
 
-    Everything is integrated in a world in which robot a begins at rest without gravity, (37, ...) states at once.
+    All states (37, ...) are integrated at once, in a world in which robot a starts at rest without gravity.
     """
     read = np.stack([np.column_stack([contents.imu[n] for n in ("wx", "wy", "wz", "ax", "ay", "az")])
                      [contents.imu["body"] == robot] for robot in ROBOTS])  # fmt: skip
@@ -189,7 +190,7 @@ def test_at_the_end_it_is_a_batch_of_least_squares_in_a_world(seed):
     t, ends, measured = ranging(4.0, seed)
     found = calib.localize_team(contents, PLANTED, CLOSE)
     tracks = [one.tracks["variance"] for one in found]
-    # Both begin at the same noisy poses and velocities, those of dead reckoning.
+    # Both start at the same noisy poses and velocities, those of dead reckoning.
     start: list[Any] = [None]
     for track in (one.tracks["dead reckoning"] for one in found):
         s = (track.time_ns[:10] - track.time_ns[0]) * 1e-9
@@ -223,17 +224,17 @@ LISTEN = calib.TeamSettings(use="receptions", noise=IMUS["industrial"])
 
 @pytest.mark.slow
 def test_three_quadcopters_know_where_the_others_are_and_how_well(known):
-    """Three flights of the paper's setting, with seeds chosen before looking."""
+    """Three flights as in the paper, with seeds that were chosen before."""
     heard = [one for seed in (301, 302, 303) for one in calib.localize_team(simulated(seed, 12.0), known, LISTEN)]
     assert [(one.body, one.reference) for one in heard] == 3 * [("robot2", "robot1"), ("robot3", "robot1")]
     found = team_json(heard)
     figures, less = found["summary"], found["reduction_by_listening"]
     rmse_m = {name: one["rmse_m"] for name, one in figures.items()}
-    # Ranges have 5 cm of noise, and baselines of half a metre see directions over three metres.
+    # Ranges have 5 cm of noise, and baselines of half a metre determine directions over three metres.
     assert rmse_m["variance"] < min(0.2, rmse_m["raw"] / 2, rmse_m["dead reckoning"] / 20)
     assert figures["variance"]["attitude_rmse_deg"] < 1.5
     for name in ("calibrated", "variance", "robust"):
-        # The paper has 48 % at best, in other flights.
+        # The paper reports 48 % at best, in other flights.
         assert 0.1 < less["ranges only"][name] < less["own ranges"][name] < 1
     for name in ("variance", "robust"):
         low, high = figures[name]["nees_bounds"]
@@ -285,7 +286,7 @@ def test_the_filter_knows_what_listeners_of_an_exchange_share(known, monkeypatch
 
 
 def test_patterns_are_corrected_by_the_estimated_poses():
-    """Antennas of all robots delay by 20 cm to the front: exact ranges, corrected, stay exact."""
+    """The antennas of all robots add 20 cm to the front: exact ranges are exact after the correction."""
     t, ends, measured = ranging(4.0, 2)
     longer = np.zeros(len(t))
     for k, (i, j) in enumerate(ends.tolist()):

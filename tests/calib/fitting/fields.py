@@ -1,6 +1,6 @@
-"""Worlds whose errors depend on places: boards in twos on bodies that swim, a smooth field of errors between any two.
+"""Worlds whose errors depend on positions: pairs of boards on moving bodies, with a smooth field of errors.
 
-Nothing here is shared with the simulator or the fit: no walls and no paths, but waves over the places of both ends.
+They share no code with simulator and fit: there are no walls and paths, but waves over the positions of both ends.
 """
 
 from dataclasses import replace
@@ -15,7 +15,7 @@ LIGHT_M_PER_NS = 0.299702547
 
 
 def swum(rng: np.random.Generator, bodies: int, time_s: Any) -> Any:
-    """Metres (bodies, n, 3) on sums of three sines an axis about places on a ring."""
+    """Return positions (bodies, n, 3) in metres on sums of three sines per axis about points on a ring."""
     angle = 2 * np.pi * (np.arange(bodies) + 0.3 * rng.random(bodies)) / bodies
     middle = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), rng.uniform(1, 2, bodies)])
     rate = 2 * np.pi / rng.uniform(4, 15, (bodies, 3, 3))
@@ -24,7 +24,9 @@ def swum(rng: np.random.Generator, bodies: int, time_s: Any) -> Any:
 
 
 def field(rng: np.random.Generator, first: Any, second: Any, size_m: float, wave_m: float) -> Any:
-    """Errors (n,) of standard deviation `size_m`, smooth over `wave_m` of either end's place (n, 3)."""
+    """Return errors (n,) with the standard deviation `size_m`, smooth over `wave_m` of the position (n, 3) of either
+    end.
+    """
     vectors = rng.normal(0, 2 * np.pi / wave_m / np.sqrt(3), (40, 6))
     angle = np.hstack([first, second]) @ vectors.T + rng.uniform(0, 2 * np.pi, 40)
     return size_m * np.sqrt(2 / 40) * np.cos(angle).sum(axis=1)
@@ -42,9 +44,10 @@ def ranges_with_field(  # noqa: PLR0913 - what a world may differ in
     noise_m: float = 0.03,
     reflected: float = 0.08,
 ) -> tuple[Ranges, Any]:
-    """Return ranges with their truth, and delays in ns by tag, 1 on, two on each body.
+    """Return ranges with true distances, and delays in ns by tag, from 1 on, two tags on each body.
 
-    Errors by place have a field of `field_m` for every two bodies, and an offset of `between_m` that stays.
+    Errors that depend on positions have the standard deviation `field_m` for every pair of bodies, constant ones
+    `between_m`.
     """
     rng = np.random.default_rng([seed, 4711])
     count = int(seconds * rate)

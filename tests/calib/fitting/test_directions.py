@@ -1,4 +1,4 @@
-"""Antennas whose delay depends on direction: found, corrected and refused, in flights of a generator of its own."""
+"""Antennas whose delay depends on direction: found, corrected and refused, in flights of a separate generator."""
 
 import json
 from dataclasses import replace
@@ -22,7 +22,7 @@ from uwblink.recording.distances import antennas_m, sights
 TEN = Recipe(reflected=0.0, noise_m=0.04)
 """Ranges differ by 10 cm over directions, and none is reflected."""
 SHORT = replace(TEN, seconds=30.0)
-"""1800 ranges, which know a pattern well enough where its errors are not what is asked."""
+"""1800 ranges, enough to fit a pattern in tests of something else than its errors."""
 
 
 @cache
@@ -41,7 +41,7 @@ def written(path, recipe, seed, number=0):
 
 
 def seen(ranges, tag):
-    """Directions in which a tag saw others (m, 3)."""
+    """Return the directions in which a tag saw others (m, 3)."""
     ends = (ranges.initiator, ranges.target)
     return np.concatenate([ranges.toward[np.isin(ids, tag), end] for end, ids in enumerate(ends)]).astype(float)
 
@@ -69,7 +69,7 @@ def test_a_planted_pattern_is_found_within_its_intervals(size_m, own):
             inside.append(np.mean(np.abs(off) < 1.96 * pattern.std_m(values)))
             error.append(np.sqrt(np.mean(off**2)))
     assert np.mean(inside) > 0.9
-    # 3600 ranges with 5 cm of noise know each of eight or 32 factors to 1 mm or 3 mm.
+    # 3600 ranges with 5 cm of noise determine each of 8 or 32 coefficients to 1 mm or 3 mm.
     assert max(error) < (0.008 if own else 0.004)
 
 
@@ -82,7 +82,7 @@ def test_another_flight_is_corrected_by_directions_from_its_poses(own, tmp_path)
         assert ("over direction" in done.stdout) == (name == "auto")
     without, known = (calib.load_calibration(tmp_path / f"{name}.json") for name in ("none", "auto"))
     there = calib.load_ranges(second)
-    # Of 6 cm, 4 are noise.
+    # 4 cm of the 6 cm are noise.
     assert spread(there, known) < 0.75 * spread(there, without)
     assert 0.92 < calib.evaluate(second, known).overall.inside_95 < 0.98
     done = run("calib", "apply", second, "-c", tmp_path / "auto.json", "-o", tmp_path / "c.uwb")
@@ -110,7 +110,7 @@ def test_sound_flights_have_no_pattern(recipe, seed):
 
 
 def test_what_belongs_to_places_does_not_pass_for_the_antennas():
-    # A robot that heads along its loop sees every wall in one direction. A pattern that is asked for stays small.
+    # A robot that heads along its loop sees every wall in one direction. A requested pattern remains small.
     (pattern,) = fitted(replace(SOUND["errors of places"], room_m=0.06), 23, pattern="shared").calibration.patterns
     assert pattern.rms_m < 0.03
 
@@ -120,7 +120,7 @@ def test_power_that_explains_what_looks_like_direction_is_named():
     ranges = calib.load_ranges(flown(replace(TEN, pattern_m=0.0), 3)[0])
     azimuth = np.arctan2(ranges.toward[:, :, 1], ranges.toward[:, :, 0])
     of_one = np.stack([ranges.initiator, ranges.target], axis=1) == 1
-    # The antenna of tag 1 is louder by 6 dB ahead, and its ranges alone grow with power.
+    # The antenna of tag 1 is stronger by 6 dB ahead, and only its ranges grow with power.
     louder = 6.0 * np.sum(np.cos(azimuth) * of_one, axis=1)
     powers = {name: getattr(ranges, name) + louder for name in ("fpp1_dbm", "fpp2_dbm")}
     order = np.argsort(np.argsort(sum(powers.values()))) / len(ranges)
@@ -205,7 +205,7 @@ def test_the_report_draws_patterns_with_their_bands_at_the_level_of_flight():
     *_, picture = SECTIONS["patterns"](Results(calibration=known, training=[flown_ranges]))
     assert isinstance(picture, Picture)
     (axes,), (pattern,) = picture.draw(7.0).axes, known.patterns
-    # Robots tilt: the middle of the flown elevations, a tenth below and a tenth above, and the circle of zero.
+    # Robots tilt: the median of the flown elevations, the 10 % and 90 % quantiles, and the circle of zero.
     *lines, zero = axes.lines
     up = np.radians([float(line.get_label()[10:-1].replace("−", "-")) for line in lines])
     level = np.quantile(seen(flown_ranges, (1, 2, 3, 4))[:, 2], (0.5, 0.1, 0.9))
@@ -218,7 +218,7 @@ def test_the_report_draws_patterns_with_their_bands_at_the_level_of_flight():
         assert line.get_ydata() == pytest.approx(100 * values @ pattern.coefficients_m, abs=0.1)
     edges = axes.collections[0].get_paths()[0].vertices[:, 1]
     assert np.ptp(edges) > np.ptp(lines[0].get_ydata()) + 196 * pattern.std_m(values).min()
-    # A page reads values of straight axes under the pointer, and none of these. Without ranges there is one line.
+    # A page shows values at the pointer for straight axes, and not for these. Without ranges there is one line.
     one = SECTIONS["patterns"](Results(calibration=known))[-1].draw
     assert (len(one(3.5).axes[0].lines), b"names" in drawn(one, 7.0, ["svg"])["svg"]) == (2, False)
     assert SECTIONS["patterns"](Results(calibration=replace(known, patterns=()))) == []
@@ -251,7 +251,7 @@ def test_a_tag_that_is_added_has_the_pattern_that_others_share_or_one_that_is_un
     assert (done.returncode, "tag 5: its pattern over direction" in done.stderr) == (0, own)
     added, planted = calib.load_calibration(tmp_path / "five.json"), flown(recipe, 3)[0].meta["planted"]["delays_ns"]
     off = [added.delays_ns[tag] - planted[str(tag)] for tag in (1, 2, 3, 4, 5)]
-    # What all delays share goes with the curve; of the rest 10 ps are 1.5 mm of a range.
+    # The common part of all delays belongs to the curve; of the rest, 10 ps are 1.5 mm of a range.
     assert off[4] - np.mean(off) == pytest.approx(0, abs=0.02 + 0.1 * own)
     of_five = there[(there.initiator == 5) | (there.target == 5)]
     error = added.apply(of_five).corrected_m - of_five.truth_m
@@ -266,7 +266,7 @@ def test_delays_of_calibrations_with_patterns_are_compared_for_the_same_directio
     known, again = (calib.fit(flown(TEN, 3, k)[0], between_m=0.0).calibration for k in (0, 1))
     found, (pattern,) = calib.compare(known, again), known.patterns
     assert (found.same, found.pattern_probability > 0.01, found.pattern_rms_m < 0.015) == (True, True, True)
-    # The same pattern about another centre, one of each tag: delays are those of other directions.
+    # The same pattern about another centre, one for each tag: delays refer to other directions.
     centres = dict(zip((1, 2, 3, 4), np.random.default_rng(1).normal(0, 0.5, (4, 8)), strict=True))
     moved_m = {tag: float((centre - pattern.centre) @ pattern.coefficients_m) for tag, centre in centres.items()}
     elsewhere = replace(
@@ -289,7 +289,7 @@ def test_delays_of_calibrations_with_patterns_are_compared_for_the_same_directio
 
 
 def test_directions_are_those_in_the_frames_of_the_bodies():
-    # Body a at the origin has turned by 90° to the left: what lies north of it is ahead. Body b looks along the axes.
+    # Body a at the origin is rotated by 90° to the left: north of it is ahead. Body b looks along the axes.
     half = np.sqrt(0.5)
     poses = uwblink.Poses(
         np.array([0, 0]), np.array(["a", "b"]), np.array([[0.0, 0, 0], [0, 4, 3]]),
@@ -304,7 +304,7 @@ def test_directions_are_those_in_the_frames_of_the_bodies():
 
 
 def test_places_without_attitudes_tell_no_direction():
-    """Bodies that are antennas, as tables with their places give: what their attitudes leave open is in sigma."""
+    """Bodies without attitudes, as in tables of positions: sigma includes the effect of unknown directions."""
     known, (found, _) = fitted(SHORT, 3).calibration, flown(SHORT, 3, 1)
     when = np.unique(found.poses.time_ns)
     places = {

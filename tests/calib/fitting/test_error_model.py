@@ -1,4 +1,4 @@
-"""The errors that a fit predicts, held against flights that it did not see: worlds of foreign code, and samples."""
+"""The errors that a fit predicts, compared with flights that were not fitted: foreign worlds, and published samples."""
 
 import json
 from dataclasses import replace
@@ -35,7 +35,7 @@ def test_held_back_flights_of_foreign_worlds(name):
     assert 0.95 < found.total_std < 1.08
     assert 0.94 < found.inside_95 < 0.96
     assert abs(found.total_mean) < 0.05
-    # Sigma is that of direct ranges, which says little of all of them.
+    # Sigma is that of direct ranges, which does not describe all of them.
     assert found.coverage["95"] < 0.93
 
 
@@ -54,11 +54,11 @@ def test_pairs_have_the_share_of_reflections_that_was_planted():
     applied = calib.fit(ranges, between_m=0.0).calibration.apply(ranges)
     planted, found, looked = (of_pairs(ranges, v) for v in (reflected, applied.tail_share, applied.tail_probability))
     assert (planted["1-2"], planted["4-5"]) == pytest.approx((0.12, 0.36), abs=0.02)
-    # A sixth of such detours are shorter than the noise, which takes them for its own; 1 900 ranges a pair scatter.
+    # A sixth of such detours are shorter than the noise and count as noise; 1,900 ranges per pair have their scatter.
     for name, share in planted.items():
         assert 0.8 * share - 0.02 < found[name] < share + 0.02
         assert looked[name] == pytest.approx(found[name], abs=0.02)
-    # A look at the range itself tells most reflections from noise.
+    # The error of the range itself distinguishes most reflections from noise.
     assert applied.tail_probability[reflected].mean() > 0.65
     assert applied.tail_probability[~reflected].mean() < 0.1
 
@@ -85,7 +85,7 @@ def test_a_power_beyond_the_curve_widens_the_total():
 
 
 def test_the_total_sigma_holds_where_reflections_are_of_two_kinds():
-    """One kind of detour took the longer of two for outliers, and stated 19 cm of 28."""
+    """A model with one kind of detour took the longer of two kinds for outliers, and stated 19 cm instead of 28."""
     ranges = make(Recipe(share=(0, 0), seconds=60, per_second=80), 20_002).ranges
     rng = np.random.default_rng([20_002, 77])
     detour = np.where(rng.random(len(ranges)) < 0.6, 0.3, 1.2) * rng.gamma(16, 1 / 16, len(ranges))
@@ -94,7 +94,7 @@ def test_the_total_sigma_holds_where_reflections_are_of_two_kinds():
     applied = calibration.apply(ranges)
     error = applied.corrected_m - ranges.truth_m
     assert np.sqrt(np.mean(applied.sigma_total_m**2)) == pytest.approx(error.std(), rel=0.05)
-    # What is written is what is read; a file of one kind is read as before, with the mean error that it had.
+    # The written model is read unchanged; a file with one kind is read as before, with the mean error that it had.
     assert calib.Calibration.from_json(calibration.to_json()) == calibration
     table = json.loads(calibration.to_json())
     del table["errors"]["long_share"], table["errors"]["long_factor"]
@@ -106,7 +106,7 @@ def test_the_total_sigma_holds_where_reflections_are_of_two_kinds():
         calib.Calibration.from_json(json.dumps(table))
 
 
-# Recordings of few ranges a pair: that the fit settles, and a real flight among obstacles.
+# Recordings with few ranges per pair: the fit converges; and a real flight among obstacles.
 
 
 FEW = "twelve tags, six ranges a pair"
@@ -115,7 +115,7 @@ FEW = "twelve tags, six ranges a pair"
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [104, 105])
 def test_few_ranges_settle(seed):
-    # These two went on for hundreds of steps in directions that no range determines.
+    # These two searches continued for hundreds of steps in directions that no range determines.
     assert calib.fit(make(CLEAN[FEW], seed).ranges).success
 
 
@@ -153,11 +153,11 @@ def test_what_few_ranges_leave_unknown_of_delays_is_in_the_intervals_of_other_ra
         calib.evaluate(of_twelve_tags(3000, 50 + seed), calib.fit(of_twelve_tags(250, seed), between_m=0.0).calibration)
         for seed in range(20, 30)
     ]
-    # The mean of ten shares, of standard deviation 3 percentage points each.
+    # The mean of ten shares, each with a standard deviation of 3 percentage points.
     assert np.mean([each.overall.inside_95 for each in inside]) == pytest.approx(0.95, abs=0.02)
 
 
-# The paper's own samples, held back from the fit: sigma, quantiles, curve and mean hold in what was not seen.
+# The published samples, held back from the fit: sigma, quantiles, curve and mean hold in unfitted samples.
 
 
 @pytest.fixture(scope="module")
@@ -170,6 +170,6 @@ def test_a_range_of_powers_that_was_left_out_is_bridged(both, number):
     lifted, bias = both
     found = judged(lifted, bias, parts(lifted)[number])
     assert found.rms_m < found.cubic_rms_m + 0.005
-    # The noise changes with power, and a fifth of all powers has not been seen.
+    # The noise changes with power, and a fifth of all powers was not fitted.
     assert 0.9 < found.z_std < 1.15
     assert 0.92 < found.inside_95 < 0.98

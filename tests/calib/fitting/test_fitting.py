@@ -1,4 +1,4 @@
-"""Delays and curves together: planted truth, the gauge, and what cannot be answered."""
+"""Delays and curves together: planted values, the gauge, and data that do not determine the result."""
 
 import math
 from dataclasses import replace
@@ -25,7 +25,7 @@ def test_planted_delays_and_curve_come_back():
     np.testing.assert_allclose(result.residuals_m, c.apply(r).corrected_m - r.truth_m, atol=1e-9)
     shift = np.mean([c.delays_ns[t] - d for t, d in DELAYS_NS.items()])
     for tag, delay in DELAYS_NS.items():
-        # 3300 ranges a pair at 5 cm leave 5 ps of standard error in a delay; four of those.
+        # 3300 ranges per pair at 5 cm give a standard error of 5 ps of a delay; four of those.
         assert c.delays_ns[tag] - shift == pytest.approx(delay, abs=0.020)
     grid = np.linspace(*c.bias_curve.range, 200)
     assert np.sqrt(np.mean((c.bias_curve(grid) - shift * 1e-9 * SPEED_OF_LIGHT - bias_m(grid)) ** 2)) < 0.004
@@ -38,7 +38,7 @@ def test_curve_is_zero_at_the_reference_power_and_delays_are_those_for_it(refere
     assert c.bias_curve(np.array([lifted]))[0] == pytest.approx(0, abs=1e-9)
     constant = bias_m(lifted) / SPEED_OF_LIGHT * 1e9
     for tag, delay in DELAYS_NS.items():
-        # What the planted curve is there counts for a delay: a range is corrected by half of two of them.
+        # The value of the planted curve there counts as a delay: a range is corrected by half of two delays.
         assert abs(c.delays_ns[tag] - (delay - constant)) < 3.5 * c.delays_std_ns[tag]
 
 
@@ -91,7 +91,7 @@ def test_the_mixture_s_standard_errors_hold():
     for seed in range(16):
         found = calib.fit(ranges(1500, seed=seed), loss="mixture").calibration
         scores.append(np.divide(*about_their_mean(found, DELAYS_NS)))
-    # 64 scores with three independent ones in four know their spread to 10 %; intervals may be a little wide.
+    # 64 scores, with three independent ones in four, determine their spread to 10 %; intervals may be slightly wide.
     assert 0.75 < np.std(scores) < 1.2
 
 
@@ -99,7 +99,7 @@ def test_a_pinned_delay_stays_and_determines_a_single_pair():
     r = ranges(6000)
     pair = r[(r.initiator == 1) & (r.target == 2)]
     assert "`fixed_ns`" in calib.fit(pair).warnings[0]
-    # The curve is zero at its reference; the planted one is not, and the other delay makes up for that.
+    # The curve is zero at its reference; the planted one is not, and the other delay compensates that.
     c = calib.fit(pair, fixed_ns={1: DELAYS_NS[1]}).calibration
     assert c.delays_ns[1] == DELAYS_NS[1]
     grid = np.linspace(*c.bias_curve.range, 400)
@@ -117,7 +117,7 @@ def test_ranges_without_any_error_have_no_delays_and_no_curve(loss):
 
 @pytest.mark.slow
 def test_a_fit_is_the_same_to_the_last_digit_whatever_the_number_of_threads():
-    # Sums of several threads end in other digits than those of one.
+    # Sums by several threads have other last digits than those by one.
     found = []
     for threads in (1, 4):
         with threadpool_limits(threads, user_api="blas"):
@@ -138,7 +138,7 @@ def test_ranges_far_too_short_are_no_inliers_and_are_counted():
 def test_a_scale_that_is_given_is_the_scale_of_the_loss():
     some = ranges(n=600)
     assert calib.fit(some, loss="cauchy", scale_ns=0.3).calibration.scale_ns == pytest.approx(0.3)
-    # Far beyond all errors, Cauchy's loss is that of least squares.
+    # Far above all errors, the Cauchy loss is that of least squares.
     wide, squares = calib.fit(some, loss="cauchy", scale_ns=1000.0), calib.fit(some, loss="l2")
     for tag in DELAYS_NS:
         assert wide.calibration.delays_ns[tag] == pytest.approx(squares.calibration.delays_ns[tag], abs=1e-4)
@@ -152,7 +152,7 @@ def test_what_is_not_known_of_the_smoothness_is_in_the_band_of_the_curve(monkeyp
     assert np.trace(whole) > 1.02 * np.trace(calib.fit(some, loss="cauchy").calibration.uncertainty.bias_m2)
 
 
-# What a fit's parameters may be: every mistake names the parameter, before anything is computed.
+# Parameters of a fit: each error names the parameter, before the computation.
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_what_is_not_known_of_the_smoothness_is_in_the_band_of_the_curve(monkeyp
         ("groups", {"a": []}),
         ("groups", {"a": [1, 2]}),
         ("groups", {"a": [1, 2, 3, 7], "b": [8]}),
-        ("sequential", True),  # of the mixture, which follows
+        ("sequential", True),  # of the mixture, whose parameters follow
     ],
 )
 def test_a_mistake_names_its_parameter(parameter, value):
@@ -198,7 +198,7 @@ def test_numpy_numbers_are_numbers():
     assert calib.fit(r, **numbers).calibration.to_json() == plain.calibration.to_json()
 
 
-# A new tag from calibrated ones.
+# A new tag from calibrated tags.
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +211,7 @@ def test_its_delay_is_found_and_nothing_else_moves(known):
     added = calib.add_tag(ranges(3000, seed=5), known, 7).calibration
     assert {t: d for t, d in added.delays_ns.items() if t != 7} == known.delays_ns
     assert added.bias_curve == known.bias_curve
-    # The fitted delays of the others share a shift with the curve, and the new one has it, too.
+    # The fitted delays of the others have a common shift with the curve, and so does the new one.
     shift = np.mean([known.delays_ns[t] - DELAYS_NS[t] for t in known.delays_ns])
     assert added.delays_ns[7] - shift == pytest.approx(DELAYS_NS[7], abs=0.05)
     assert 0.002 < added.delays_std_ns[7] < 0.03
@@ -232,7 +232,7 @@ def test_what_cannot_be_added(known):
         calib.add_tag(r, replace(known, delays_ns={99: 0.0}), 7)
 
 
-# Robust losses: their weights and slopes, and losses of one's own.
+# Robust losses: their weights and slopes, and registered losses.
 
 
 @pytest.mark.parametrize("loss", ["cauchy", "huber", "soft_l1", "l2"])
@@ -263,10 +263,10 @@ def test_a_loss_of_ones_own_is_fitted_with(own_loss):
     assert result.calibration.loss == "welsch"
     matrix, alone = design(r, r.tags()), calib.fit(r, loss=own_loss, scale_ns=0.1, delays_only=True)
     u = alone.residuals_m / (0.1 * SPEED_OF_LIGHT * 1e-9)
-    # At the optimum of this loss, and of no other, its scores cancel.
+    # At the optimum of this loss only, its scores sum to zero.
     assert np.abs(matrix.T @ (u * np.exp(-(u**2) / 2))).max() < 0.1 * np.abs(matrix.T @ (u / (1 + u**2))).max()
     away = np.array([result.calibration.delays_ns[tag] for tag in DELAYS_NS]) - list(DELAYS_NS.values())
-    # A shift common to all is the curve's constant; 50 ps are five standard errors.
+    # A common shift of all is the constant of the curve; 50 ps are five standard errors.
     np.testing.assert_allclose(away - away.mean(), 0, atol=0.05)
 
 
@@ -295,7 +295,7 @@ def test_a_registered_loss_is_replaced_only_when_asked(own_loss):
     np.testing.assert_array_equal(LOSSES[own_loss].weights(np.ones(1)), LOSSES["cauchy"].weights(np.ones(1)))
 
 
-# What a fit returns: it prints on a screen, plots itself and saves.
+# The result of a fit prints on a screen, plots itself and saves.
 
 
 matplotlib.use("Agg")

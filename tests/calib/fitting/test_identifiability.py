@@ -1,4 +1,4 @@
-"""Pairs of tags, which delays they determine, and from how many ranges on a group has a curve."""
+"""Pairs of tags, the delays that they determine, and the number of ranges from which a group has a curve."""
 
 from dataclasses import replace
 
@@ -74,11 +74,11 @@ def test_curves_fitted_after_delays_leave_the_same_sides_undetermined(pairs):
 
 
 def test_calibrations_of_two_sides_are_compared_by_what_they_determine():
-    """A fit to all pairs knows each delay, one to pairs between two sides only their sums."""
+    """A fit to all pairs determines each delay, one to pairs between two sides only their sums."""
     whole = calib.fit(ranges(8000)).calibration
     part = calib.fit(among(ranges(8000, seed=2), ACROSS)).calibration
     found = calib.compare(whole, part)
-    # Four delays less a common shift and the split.
+    # Four delays minus a common shift and the split.
     assert (found.same, found.degrees) == (True, 2)
     assert not calib.compare(whole, replace(part, delays_ns=part.delays_ns | {3: part.delays_ns[3] + 0.4})).same
     shifted = {1: 0.5, 2: 0.5, 3: -0.5, 7: -0.5}
@@ -110,7 +110,7 @@ def among(r, pairs):
 
 @pytest.mark.parametrize("loss", ["mixture", "cauchy"])
 def test_delays_of_bipartite_pairs_are_the_smallest(loss):
-    """Clock skews that vary, as those of real boards, would pin the free direction to a hundred nanoseconds."""
+    """Variable clock skews, as on real boards, must not determine the free direction, to a hundred nanoseconds."""
     r = ranges(8000)
     skew = np.random.default_rng(2).normal(0, 1e-6, len(r))
     r = replace(r, weight_target=0.5 * (1 + skew))[np.isin(r.initiator, [1, 2]) & np.isin(r.target, [3, 7])]

@@ -1,4 +1,4 @@
-"""Fits for what people have: each finds what was planted, and says what it cannot know."""
+"""Fits to incomplete data: each finds the planted values, and states what it cannot determine."""
 
 import math
 from dataclasses import replace
@@ -30,7 +30,7 @@ def told(result, fragment):
 
 
 def near_planted(calibration, *, but=0.0):
-    # 500 ranges a tag at 4 cm leave 12 ps of a delay, and the intervals are held elsewhere: four of those.
+    # 500 ranges per tag at 4 cm determine a delay to 12 ps (intervals have their own tests); four of those.
     errors = {tag: calibration.delays_ns[tag] - DELAYS_NS[tag] - but for tag in calibration.delays_ns}
     assert max(map(abs, errors.values())) < 0.05, errors
 
@@ -44,7 +44,7 @@ def test_delays_alone_need_no_power():
     assert result.calibration.bias_curve.flat
     assert not result.calibration.needs_power
     assert "the effect of power is unknown" in told(result, "delays only")
-    # And its calibration corrects ranges without a power, with a sigma.
+    # Its calibration corrects ranges without power, with a sigma.
     one = result.calibration.correct(3.0, math.nan, math.nan, 1, 2)
     expected = 3.0 + NS_M * (result.calibration.delays_ns[1] + result.calibration.delays_ns[2]) / 2
     assert one.range_m == pytest.approx(expected)
@@ -58,7 +58,7 @@ def test_delays_alone_say_how_much_power_would_have_changed(settings):
     result = calib.fit(ranges(Plan(bias=bias_m)), delays_only=True, **settings)
     reach = bias_m(-94.35) - bias_m(-82.65)
     said = told(result, "delays only")
-    # The curve's reach between the powers that 5 % and 95 % stay below, within the scatter of medians of a bin.
+    # The change of the curve between the 5 % and 95 % quantiles of power, within the scatter of medians of a bin.
     assert float(said.split("here ")[1].split(" cm")[0]) == pytest.approx(100 * reach, abs=1.6)
     middle = float(np.mean([bias_m(p) for p in np.linspace(-95, -82, 200)]))
     near_planted(result.calibration, but=-middle / NS_M)
@@ -99,7 +99,7 @@ def test_pairs_have_constants_of_their_own_where_delays_cannot_explain_them():
     found = result.calibration
     for (a, b), one in found.pair_offsets.items():
         wanted = pair_constant_m(a, b) + plan.pair_m.get((a, b), 0.0)
-        # 500 ranges a pair at 4 cm: 1.8 mm of standard error; the tail of reflections doubles it.
+        # 500 ranges per pair at 4 cm: a standard error of 1.8 mm, which the tail of reflections doubles.
         assert one.offset_m == pytest.approx(wanted, abs=0.012)
         assert 0.001 < one.std_m < 0.008
     assert len(found.pair_offsets) == 12
@@ -123,24 +123,24 @@ def test_one_power_makes_a_flat_curve_and_says_so():
 
 @pytest.mark.slow
 def test_real_ranges_whose_power_follows_their_distance(tmp_path):
-    """Two boards on tripods, 2 to 60 m apart: no delays, and a curve known to centimetres; one constant can be had."""
+    """Two boards on tripods, 2 to 60 m apart: no delays, a curve known to centimetres, and a constant if requested."""
     table = shared("hanyang_sstwr.csv.gz")
     uwblink.import_recording(table, tmp_path / "h.uwb", map_file=ROOT / "docs" / "maps" / "hanyang.toml")
     known = calib.load_ranges(tmp_path / "h.uwb")
     assert calib.fit(known).calibration.undetermined_splits == (((1,), (12,)),)
     curved = calib.fit(known, constants="pair").calibration
-    # Distance explains four fifths of the power: the band is wider than an error of distances of 1 % would make it.
+    # Distance explains four fifths of the power: the band is wider than the effect of an error of distances of 1 %.
     band = curved.band(np.array(curved.bias_curve.range), "bias")
     assert band is not None
     assert np.median(band) > 0.01
     result = calib.fit(known, constants="pair", delays_only=True)
     assert "without carrier readings" in told(result, "single-sided")
     ((pair, one),) = result.calibration.pair_offsets.items()
-    # The mode of the errors, from a histogram of 5 cm.
+    # The mode of the errors, from a histogram with bins of 5 cm.
     counts, edges = np.histogram(known.raw_m - known.truth_m, np.arange(-1, 3, 0.05))
     assert pair == (1, 12)
     assert one.offset_m == pytest.approx(edges[np.argmax(counts)] + 0.025, abs=0.15)
-    # Errors last for minutes here: what they leave open of detours may not be taken for detours of 15 m.
+    # Errors last for minutes here: the uncertainty of detours must not become detours of 15 m.
     applied = result.calibration.apply(known)
     score = (applied.corrected_m - known.truth_m - applied.mean_error_m) / applied.sigma_total_m
     assert 0.7 < float(np.std(score)) < 1.3

@@ -1,4 +1,4 @@
-"""Delays from overheard exchanges: one target at a time, whatever the graph of pairs, and never a split."""
+"""Delays from overheard exchanges: each target separately, for any graph of pairs, without the split of a delay."""
 
 from pathlib import Path
 
@@ -29,8 +29,8 @@ def test_without_noise_they_are_what_was_planted(tmp_path):
     heard = heard_delays(path, NOTHING)
     assert len(heard) >= 3
     for tag, found in heard.items():
-        # Stamps are whole ticks of 15.6 ps, five of them; hundreds of exchanges average them to under a picosecond, but
-        # the ratio of clocks over a third leg five times as long adds a drift of some picoseconds.
+        # Stamps are whole ticks of 15.6 ps, five of them; hundreds of exchanges average them to less than a picosecond,
+        # but the ratio of clocks over a third interval five times as long adds a drift of some picoseconds.
         assert found.delay_ns == pytest.approx(planted[str(tag)], abs=0.005), tag
 
 
@@ -40,7 +40,8 @@ def test_they_agree_with_the_fit_of_a_noisy_flight(tmp_path):
     found = fit(load_ranges(path)).calibration
     heard = heard_delays(path, found)
     assert (heard_delays(uwblink.load(path), found), len(heard)) == (heard, 4)
-    # Both have the curve's constant in the same gauge. A fit of 60 s knows a delay to 17 ps, listeners to 8.
+    # Both have the constant of the curve in the same gauge. A fit of 60 s determines a delay to 17 ps, listeners to 8
+    # ps.
     for tag, one in heard.items():
         assert one.delay_ns == pytest.approx(found.delays_ns[tag], abs=0.06)
 

@@ -1,4 +1,6 @@
-"""Errors that belong to places are in all ranges between two bodies: they are seen, named, and in the intervals."""
+"""Errors that depend on positions are common to all ranges between two bodies: they are found, named, and in the
+intervals.
+"""
 
 import re
 from dataclasses import replace
@@ -15,7 +17,7 @@ from tests.calib.synthetic import DELAYS_NS, about_their_mean, bias_m, ranges
 
 
 def apart(result, planted):
-    """Errors of delays about their mean (tags,) in ns, and their standard errors."""
+    """Return errors of delays about their mean (tags,) in ns, and their standard errors."""
     found = result.calibration
     return about_their_mean(found, dict(zip(found.uncertainty.tags, planted, strict=True)))
 
@@ -25,7 +27,7 @@ def named(result):
 
 
 def test_offsets_between_bodies_that_last_are_in_the_intervals_and_named():
-    # Without bodies being known, pairs count for independent, and intervals hold in half of the cases.
+    # If the bodies were unknown, pairs would count as independent, and intervals would hold in half of the cases.
     blind, seeing = [], []
     for seed in range(2):
         ranges, planted = ranges_with_field(seed, bodies=5, seconds=25.0, field_m=0.01, between_m=0.03)
@@ -36,13 +38,13 @@ def test_offsets_between_bodies_that_last_are_in_the_intervals_and_named():
         seeing.append(apart(result, planted))
         blind.append(apart(unknown, planted))
     scores = [np.concatenate([error / std for error, std in some]) for some in (seeing, blind)]
-    # Of twenty delays, those of a body are wrong alike: ten bodies' worth of values.
+    # The delays on one body have the same error, so twenty delays are ten independent values.
     assert np.mean(np.abs(scores[0]) < 1.96) > 0.85
     assert np.mean(np.abs(scores[1]) < 1.96) < 0.8
 
 
 def test_errors_that_come_and_go_are_named_where_bodies_are_as_many_as_their_pairs():
-    # Three bodies, three pairs: delays take up whatever stays, and only what comes and goes can tell.
+    # With three bodies and three pairs, delays absorb constant errors, and only variable ones can be found.
     ranges, planted = ranges_with_field(1, bodies=3, seconds=40.0, field_m=0.02, wave_m=4.0)
     result = calib.fit(ranges)
     assert named(result)
@@ -66,7 +68,7 @@ def test_ranges_know_the_bodies_of_their_tags_as_long_as_recordings_agree():
     assert {tag.tag: tag.body for tag in flight.tags} == dict(calib.load_ranges(flight).bodies)
 
 
-# Tags that read powers unlike the others: found by what differs between the ends of a link, and what it does said.
+# Tags that read powers differently from others: found by differences between the ends of a link; the effect is stated.
 
 
 SENT_DB, READ_DB = {2: -3.0}, {3: 2.0}
@@ -74,10 +76,10 @@ NOBODY: dict[int, float] = {}
 
 
 def world(sent=NOBODY, read=NOBODY, noise_db=0.0, **more):
-    """Errors follow the powers that arrive; what is recorded is what tags read of them."""
+    """Errors depend on the powers that arrive; recorded are the readings of the tags."""
     rng = np.random.default_rng(3)
     r = ranges(**({"n": 6000} | more))
-    # One way there and back: both powers lose the same.
+    # The path loss is equal in both directions: both powers are reduced by the same.
     r = replace(r, fpp2_dbm=r.fpp1_dbm, raw_m=r.raw_m + bent(r.fpp1_dbm) - lifted_bent(r))
 
     def gain(table, tags):
@@ -89,7 +91,7 @@ def world(sent=NOBODY, read=NOBODY, noise_db=0.0, **more):
 
 
 def bent(power_dbm):
-    """A curve of 12 mm a decibel."""
+    """A curve of 12 mm per decibel."""
     return -0.012 * (power_dbm + 87)
 
 
@@ -99,7 +101,7 @@ def lifted_bent(r):
 
 def test_levels_are_exact_without_noise_and_as_near_as_they_say_with_it():
     exact, noisy = (power_levels_db(world(SENT_DB, READ_DB, noise_db=noise)) for noise in (0.0, 1.0))
-    # What a tag sends more weakly looks like what it reads higher.
+    # Low transmit power has the same effect as high readings.
     for tag, expected in {1: 0, 2: 3, 3: 2, 7: 0}.items():
         assert exact[tag][0] == pytest.approx(expected, abs=1e-9)
         level, std = noisy[tag]
@@ -120,16 +122,17 @@ def test_a_tag_that_reads_too_high_is_named_with_what_its_delay_holds():
     assert said.startswith("powers of tag 3 (+2.0 dB) differ from the others")
     held_ps = float(re.search(r"up to (\d+) ps", said)[1])
     away = np.array([result.calibration.delays_ns[tag] - delay for tag, delay in DELAYS_NS.items()])
-    # A shift common to all is the curve's constant, so the others are the reference; a fifth for how the curve bends.
+    # A common shift of all is the constant of the curve, so the others are the reference; a fifth for the bend of the
+    # curve.
     assert 1e3 * abs(away[2] - np.mean(np.delete(away, 2))) == pytest.approx(held_ps, rel=0.2)
     assert held_ps > 50
 
 
-# Lengths and powers in other units than metres and dBm: nothing is fitted to them, and the unit is named.
+# Lengths and powers in other units than metres and dBm: they are not fitted, and the unit is named.
 
 
 def hardly_moving(seed=1):
-    """Return ranges of bodies that move by a decimetre or two, so that no slope over distance tells a unit."""
+    """Return ranges of bodies that move by one or two decimetres, so that the slope over distance shows no unit."""
     some = synthetic.ranges(n=900, seed=seed)
     truth = 2.5 + 0.2 * np.random.default_rng(seed).random(len(some))
     return replace(some, raw_m=some.raw_m - some.truth_m + truth, truth_m=truth)

@@ -1,4 +1,4 @@
-"""Features that tell reflections: slopes of their odds are found, stated and used, in ranges of NumPy alone."""
+"""Features that indicate reflections: slopes of their odds are found, stated and used, in ranges of NumPy alone."""
 
 import json
 import re
@@ -18,7 +18,7 @@ from uwblink.recording.schema import CirRow
 from uwbsim import simulate
 
 RISE, EXCESS = 1.2, 0.15
-"""Planted slopes of the log odds, a tap and a decibel."""
+"""Planted slopes of the log odds per tap and per decibel."""
 
 
 @cache
@@ -57,7 +57,7 @@ def without_features(ranges):
 def test_planted_slopes_are_found(seed):
     found = fitted(seed).errors.features
     assert found.keys() == {"rise_taps", "response_db"}
-    # Some 1500 reflections know a slope to 6 % of one over the feature's deviation: 0.05 a tap, 0.02 a decibel.
+    # 1500 reflections determine a slope to 6 % of one over the feature's deviation: 0.05 per tap, 0.02 per decibel.
     assert found["rise_taps"].log_odds == pytest.approx(RISE, abs=0.2)
     assert found["response_db"].log_odds == pytest.approx(EXCESS, abs=0.06)
 
@@ -74,9 +74,9 @@ def test_probabilities_hold_in_ranges_that_were_not_fitted():
     edges = np.quantile(told, np.linspace(0, 1, 11)[1:-1])
     for k in range(10):
         some = np.digitize(told, edges) == k
-        # 800 ranges know a share to 0.018; slopes and level add as much.
+        # 800 ranges determine a share to 0.018; slopes and level add as much.
         assert told[some].mean() == pytest.approx(reflected[some].mean(), abs=0.055)
-    # Power alone predicts the same for nearly all.
+    # Power alone predicts nearly the same for all.
     alone = fitted(71).apply(without_features(ranges)).tail_share
     assert np.mean((told - share) ** 2) < 0.1 * np.mean((alone - share) ** 2)
 
@@ -122,8 +122,9 @@ def test_files_keep_the_slopes_and_refuse_others(tmp_path):
 
 
 def response(rise, first=740.3, noise=10, late=0, length=1016):
-    """Return the taps of a response: noise, a path that rises in some taps from before the first path, and a later
-    one."""
+    """Return the taps of a response: noise, a path that rises within some taps from before the first path, and a later
+    one.
+    """
     rng = np.random.default_rng(5)
     taps = np.abs(rng.normal(0, noise, length)) + np.abs(rng.normal(0, noise, length))
     at = int(first) + 2
@@ -163,8 +164,8 @@ def contents(rows):
     [
         ([(0, 1, 1), (10**9 + 130_000_000, 2, 4)], [2, 5]),
         ([(130_000_000, 1, 1), (140_000_000, 2, 5)], [4, np.nan]),
-        ([(130_000_000, 7, 1)], None),  # a listener: another path
-        ([(700_000_000, 1, 1)], None),  # too late to be of the first, and before the second
+        ([(130_000_000, 7, 1)], None),  # of a listener, whose path is another one
+        ([(700_000_000, 1, 1)], None),  # too late for the first exchange, and before the second
     ],
 )
 def test_responses_belong_to_the_exchange_before_them(tmp_path, rows, expected):

@@ -1,4 +1,4 @@
-"""Several recordings in one fit: gaps between them count for nothing, and what differs between them is told."""
+"""Several recordings in one fit: gaps between them have no effect, and differences between them are named."""
 
 import re
 from dataclasses import replace
@@ -16,13 +16,13 @@ RECIPE = Recipe(tags=4, seconds=20, per_second=120)
 
 
 def moved(ranges, tag, by_ns):
-    """Return ranges as they are when a tag's antenna delay is another one."""
+    """Return ranges with another antenna delay of a tag."""
     weight = (ranges.initiator == tag) * ranges.weight_initiator + (ranges.target == tag) * ranges.weight_target
     return replace(ranges, raw_m=ranges.raw_m - weight * by_ns * LIGHT_M_PER_NS)
 
 
 def sessions(hours, *, seed=20_001, moved_ns=0.0, recipe=RECIPE):
-    """Return the delays of a world, and two recordings of it, the second so many hours after the first."""
+    """Return the delays of a world, and two recordings of it, the second some hours after the first."""
     world, later = make(recipe, seed), make(recipe, seed, flight=1)
     begin = int(world.ranges.time_ns[-1] - later.ranges.time_ns[0]) + int(hours * HOUR_NS)
     second = replace(later.ranges, time_ns=later.ranges.time_ns + begin, source="tuesday.uwb")
@@ -30,7 +30,7 @@ def sessions(hours, *, seed=20_001, moved_ns=0.0, recipe=RECIPE):
 
 
 def between(found):
-    """Return the warnings that say what differs between recordings."""
+    """Return the warnings on differences between recordings."""
     return [said for said in found.warnings if "monday.uwb" in said or "tuesday.uwb" in said]
 
 
@@ -49,7 +49,7 @@ def test_neither_hours_between_sessions_nor_times_that_begin_at_zero_change_anyt
 
 
 def test_five_short_recordings_of_many_tags_are_one_fit():
-    # 66 pairs in five recordings have more offsets than there are ranges, which noise must survive.
+    # 66 pairs in five recordings have more offsets than there are ranges; the noise must not become zero.
     recipe, seed = Recipe(tags=12, seconds=6, per_second=10), 20_003
     parts = [make(recipe, seed, flight).ranges for flight in range(5)]
     parts = [replace(part, time_ns=part.time_ns + k * HOUR_NS, source=f"{k}.uwb") for k, part in enumerate(parts)]
@@ -57,7 +57,8 @@ def test_five_short_recordings_of_many_tags_are_one_fit():
     assert found.warnings == []
     known, planted = found.calibration, make(recipe, seed).delays_ns
     lifted = np.median(np.concatenate([known.lifted(part) for part in parts]))
-    # 300 ranges, half of which the unknowns use up, know their noise to 6 %; power has a part in it.
+    # 300 ranges, half of whose degrees of freedom the unknowns use, determine their noise to 6 %; power has a part in
+    # it.
     assert known.sigma_curve(lifted) == pytest.approx(sigma_m(lifted, recipe.noise_m), rel=0.25)
     assert np.abs(np.divide(*about_their_mean(known, planted))).max() < 3
 
@@ -100,7 +101,7 @@ def test_scatter_between_sessions_is_in_the_intervals():
         ]
         parts.append((ranges, replace(ranges, raw_m=ranges.raw_m + offset)))
     sound, scattered = (calib.fit([part[k] for part in parts]).calibration for k in (0, 1))
-    # Two centimetres in each of three pairs of a tag, in each of two sessions, are some 50 ps of its delay.
+    # Two centimetres in each of three pairs of a tag, in each of two sessions, are about 50 ps of its delay.
     assert np.mean(list(sound.delays_std_ns.values())) < 0.03
     assert 0.03 < np.mean(list(scattered.delays_std_ns.values())) < 0.15
 
@@ -118,27 +119,28 @@ def test_intervals_hold_the_delay_of_a_session_that_is_short():
     assert between(found)
     delays, std = found.calibration.delays_ns, found.calibration.delays_std_ns
     error = delays[3] - known[3] - np.mean([delays[tag] - known[tag] for tag in (1, 2, 4)])
-    # With an offset in each session the delay is at most their mean: halfway.
+    # With an offset in each session, the delay is at most their mean: halfway.
     assert error < 0.2
-    # Wide enough for the short session's delay, which is 0.34 ns away, and not much wider.
+    # Wide enough for the delay of the short session, 0.34 ns away, and not much wider.
     assert abs(error - 0.4) < 1.96 * std[3] < 0.47
 
 
 def test_the_p_value_counts_all_tests():
-    # A difference that is just named: by its own test alone, one of some fifty, it would be fifty times as unlikely.
+    # The difference is just large enough to be named: by its own test alone, one of fifty, p would be fifty times
+    # smaller.
     _, parts = sessions(6, moved_ns=0.2, recipe=replace(RECIPE, seconds=10, per_second=60))
     (said,) = between(calib.fit(parts))
     assert 2e-4 < float(said.split("p = ")[1].split(")")[0]) <= 5e-3
 
 
-# Delays that drift from day to day: a rate where sessions tell one, and none where nothing drifts.
+# Delays that drift from day to day: a rate is found if sessions show one, and none if nothing drifts.
 
 
 DRIFTING = Recipe(tags=5, seconds=20, per_second=120)
 
 
 def drifting(seed, days, rate_m2=0.0, scatter_m=0.0, *, begin=20_000, wander_m=0.0):
-    """Recordings on some days: what each tag adds to ranges is a random walk of a rate a day, and scatters besides."""
+    """Return recordings on some days: ranges of each tag have a random walk with a variance per day, and a scatter."""
     steps, scatter = np.random.default_rng([seed, 77]).normal(size=(2, len(days), DRIFTING.tags + 1))
     walk = np.cumsum(np.sqrt(rate_m2 * np.diff(days, prepend=days[0]))[:, None] * steps, axis=0)
     for k, adds_m in enumerate(walk + scatter_m * scatter):
@@ -149,7 +151,9 @@ def drifting(seed, days, rate_m2=0.0, scatter_m=0.0, *, begin=20_000, wander_m=0
 
 
 def told(seeds, *args, **kwargs):
-    """Whether sessions tell a drift, whether by age, and the rate (3,) with its interval, of each world (worlds, 5)."""
+    """Return whether sessions show a drift, whether by age, and the rate (3,) with its interval, of each world (worlds,
+    5).
+    """
     days = [np.cumsum([0, *np.random.default_rng([seed, 5]).uniform(2, 15, 2 + seed % 4)]) for seed in seeds]
     fits = (calib.fit(drifting(seed, when, *args, **kwargs)) for seed, when in zip(seeds, days, strict=True))
     drifts = (one.calibration.provenance["drift"] for one in fits)
@@ -159,7 +163,7 @@ def told(seeds, *args, **kwargs):
 @pytest.mark.slow
 @pytest.mark.parametrize(("rate_m2", "wander_m"), [(1e-5, 0.0), (1e-4, 0.04)])
 def test_the_rate_of_a_drift_is_found_within_its_interval(rate_m2, wander_m):
-    # Errors of pairs that last for seconds scatter between sessions, too.
+    # Errors of pairs that last for seconds also scatter between sessions.
     drifts, by_age, low, likeliest, high = told(range(12), rate_m2, wander_m=wander_m)
     # Of 12 intervals that hold with 90 %, 9 or more do in 97 of 100 such studies.
     assert np.sum((low <= rate_m2) & (rate_m2 <= high)) >= 9
@@ -171,7 +175,7 @@ def test_the_rate_of_a_drift_is_found_within_its_interval(rate_m2, wander_m):
 @pytest.mark.parametrize(("wander_m", "most_m2"), [(0.0, 3e-6), (0.04, 1e-4)])
 def test_nothing_is_claimed_where_nothing_drifts(wander_m, most_m2):
     drifts, by_age, *_, high = told(range(20, 28), wander_m=wander_m)
-    # Sessions still bound what they do not see.
+    # Sessions still give an upper bound.
     assert (drifts.any(), by_age.any(), high.max() < most_m2) == (False, False, True)
 
 
@@ -189,8 +193,8 @@ def test_what_scatters_between_sessions_is_not_called_age(worlds, most):
             (0, 3, 10, 24),
             r"4 sessions over 24 days: delays drift, .* 2 cm for (\d+) days \((\d+) to (\d+), 95 %\)",
         ),
-        (0.0, (0, 3, 10, 24), r"4 sessions over 24 days tell no drift: .* 2 cm for (\d+) days or more"),
-        (1e-4, (0, 7), r"2 sessions over 7 days: delays differ, and do not tell whether by age; .*for (\d+) days"),
+        (0.0, (0, 3, 10, 24), r"4 sessions over 24 days show no drift: .* 2 cm for (\d+) days or more"),
+        (1e-4, (0, 7), r"2 sessions over 7 days: delays differ, but not significantly by age; .*for (\d+) days"),
     ],
 )
 def test_show_says_how_old_a_calibration_may_get(tmp_path, rate_m2, days, says):
@@ -199,7 +203,7 @@ def test_show_says_how_old_a_calibration_may_get(tmp_path, rate_m2, days, says):
     low, likeliest, high = result.calibration.provenance["drift"]["m2_per_day"]
     printed = re.search(f"age: {says}", run("calib", "show", tmp_path / "known.json").stdout).groups()
     rates = np.array([likeliest, high, low] if low else [high])[: len(printed)]
-    # 1.96 times the root of the rate and the days is 2 cm.
+    # 1.96 times the root of the rate times the days is 2 cm.
     assert [*map(int, printed)] == pytest.approx(0.02**2 / 1.96**2 / rates, abs=0.6)
 
 

@@ -1,4 +1,4 @@
-"""The joint fit against an independent optimiser, the paper's recipe, groups of tags, and what smooths the curve."""
+"""The joint fit compared with an independent optimiser, the recipe of the paper, groups of tags, and smooth curves."""
 
 import json
 from dataclasses import replace
@@ -15,7 +15,7 @@ from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
 
 @pytest.mark.slow
 def test_the_joint_fit_is_better_where_power_goes_with_the_pair():
-    # Delays alone take for a delay what a pair's own power does to its ranges.
+    # A fit of delays alone takes the effect of a pair's typical power for a delay.
     slope = 0.2
     r = ranges(12_000, bias=lambda lifted: slope * lifted)
     low = (r.initiator == 1) | (r.target == 1)
@@ -44,7 +44,7 @@ def test_groups_of_tags_get_their_own_curves():
         assert np.std(c.groups[name].bias_curve(grid) - (sign * bias_m(grid))) < 0.006, name
         assert c.groups[name].bias_curve(np.array([1.0]))[0] == pytest.approx(0, abs=1e-9)
     assert (Calibration.from_json(c.to_json()), json.loads(c.to_json())["schema_version"]) == (c, 2)
-    # A range between the groups has the mean of both curves, which is none at all here.
+    # A range between the groups has the mean of both curves, which is zero here.
     r = grouped(ranges(3000, seed=8), groups)
     applied = c.apply(r)
     assert np.median(np.abs(np.median(applied.corrected_m - r.truth_m))) < 0.02
@@ -56,11 +56,11 @@ def test_a_single_pair_gets_the_smallest_delays():
     r = ranges(3000)
     c = fit(r[(r.initiator == 1) & (r.target == 2)]).calibration
     assert all(np.isinf(std) for std in c.delays_std_ns.values())
-    # Smallest means that both get the same share of what is missing (K is one to a part in 10^5).
+    # With the smallest delays, both get the same share of the sum (K is one to a part in 10^5).
     assert c.delays_ns[1] == pytest.approx(c.delays_ns[2], abs=1e-5)
     assert Calibration.from_json(c.to_json()) == c
     assert '"1": null' in c.to_json()
-    # Two delays less a common shift and the split: nothing is left to compare but the ranges of the pair.
+    # Two delays minus a common shift and the split: only the ranges of the pair can be compared.
     found = compare(fit(r).calibration, c)
     assert (found.verdict, found.degrees) == ("unknown", 0)
     assert abs(found.offset_m) < 0.02
@@ -70,7 +70,7 @@ def test_a_single_pair_gets_the_smallest_delays():
 def test_a_reference_power_moves_a_constant_and_corrects_ranges_alike(settings):
     r = ranges(600)
     if settings.get("fixed_ns"):
-        # Of a single pair the other delay takes over the constant.
+        # For a single pair, the other delay compensates the constant.
         r = r[(r.initiator == 1) & (r.target == 2)]
     plain, stated = (fit(r, sequential=True, reference_power_dbm=at, **settings).calibration for at in (None, -84.0))
     assert stated.bias_curve(np.array([10**-0.2]))[0] == pytest.approx(0, abs=1e-9)
@@ -85,14 +85,14 @@ def test_the_band_holds_the_curve():
         grid = np.linspace(*c.bias_curve.range, 50)
         wrong = c.bias_curve(grid) - bias_m(grid)
         inside.append(np.abs(wrong - wrong.mean()) < 1.96 * np.asarray(c.band(grid, "bias"), dtype=float))
-    # 150 points, of which some eight a curve are independent: 95 % to within 5 % either side, and the tail of
-    # reflections that a Cauchy loss lets through takes a little more.
+    # 150 points, of which about eight per curve are independent: 95 % within 5 % on either side, and a little more for
+    # the reflections that a Cauchy loss does not remove.
     assert np.mean(inside) > 0.88
 
 
 def test_curvature_is_the_integral_of_squared_second_derivatives():
     knots = np.concatenate([[0.0] * 4, [0.3, 0.9], [2.0] * 4])
-    # x^3 has the second derivative 6 x, whose square's integral over (0, 2) is 96; lengths count in spans of 2.
+    # x^3 has the second derivative 6 x, whose square has the integral 96 over (0, 2); lengths are in spans of 2.
     fine = np.linspace(0, 2, 400)
     coefficients = np.linalg.lstsq(basis(fine, knots), fine**3, rcond=None)[0]
     assert coefficients @ curvature(knots) @ coefficients == pytest.approx(96 * 2**3, rel=1e-9)
@@ -112,7 +112,7 @@ def test_power_that_goes_with_distance_is_warned_of():
     r = ranges(5000)
     assert not any("confounded" in warning for warning in fit(r).warnings)
     rng = np.random.default_rng(1)
-    # Lifted power falls straight with distance: a curve over the one may be an error by the other.
+    # Lifted power decreases linearly with distance: a curve over power may be an error by distance.
     power = -82 + 10 * np.log10(3.0 - 0.45 * r.truth_m + rng.normal(size=(2, len(r))) * 0.01)
     found = fit(replace(ranges(5000, bias=lambda lifted: 0.1 * lifted), fpp1_dbm=power[0], fpp2_dbm=power[1]))
     assert any("confounded" in warning for warning in found.warnings)
@@ -132,7 +132,7 @@ def test_a_likelihood_that_leaves_a_pair_out_is_not_believed(monkeypatch):
 
     def lost(model, *words):
         found = found_by(model, *words)
-        # 75 cm in all ranges of a tag: farther from the robust start than reflections move a median.
+        # 75 cm in all ranges of a tag: farther from the robust start than reflections shift a median.
         return replace(found, residuals=found.residuals + 0.75 * (model.ranges.initiator == 1))
 
     monkeypatch.setattr(known_distances, "fit_likelihood", lost)

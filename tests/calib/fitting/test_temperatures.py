@@ -23,7 +23,7 @@ from tests.uwblink.importers.test_table_forms import as_messages, flights, wrapp
 from uwblink.importers.guess import guess_map
 
 WARM = Recipe(pattern_m=0.0, reflected=0.0, noise_m=0.04, warmer_k=15.0, mm_per_k=5.0)
-"""Boards warm up by 15 K in a minute, and ranges grow by 5 mm a kelvin of either end: by 15 cm."""
+"""Boards warm up by 15 K in a minute, and ranges grow by 5 mm per kelvin of either end: by 15 cm."""
 
 
 flown = cache(flight)
@@ -52,7 +52,7 @@ def test_planted_slopes_are_found_within_their_intervals(mm_per_k, apart, patter
     slopes, planted = fitted(recipe, 41).temperatures, flown(recipe, 41)[1]["mm_per_k"]
     assert [one.tags for one in slopes] == ([(1,), (2,), (3,), (4,)] if apart else [(1, 2, 3, 4)])
     for one in slopes:
-        # 3600 ranges with 5 cm of noise over 15 K know a common slope to 0.15 mm/K, and each tag's to 0.6.
+        # 3600 ranges with 5 cm of noise over 15 K determine a common slope to 0.15 mm/K, and that of each tag to 0.6.
         assert one.std_m_per_k < (0.0007 if apart else 0.0002)
         assert abs(one.m_per_k - 1e-3 * planted[one.tags[0]]) < 3 * one.std_m_per_k
 
@@ -79,7 +79,7 @@ def test_a_warmer_flight_is_corrected_by_its_readings(tmp_path):
     with pytest.warns(TemperatureWarning, match=r"^tags 1, 2, 3, 4 were used more than 5 K outside the 20 to 3\d °C"):
         judged = calib.evaluate(second, known).overall
     assert 0.92 < judged.inside_95 < 0.98
-    # At 18 K above the fitted mean ranges are 18 cm too long; the slope's standard error leaves 0.5 cm.
+    # At 18 K above the fitted mean, ranges are 18 cm too long; the standard error of the slope leaves 0.5 cm.
     assert judged.full.abs95_m < 0.1 < 0.2 < calib.evaluate(second, without).overall.full.abs95_m
     said = run("calib", "apply", second, "-c", tmp_path / "auto.json", "-o", tmp_path / "c.uwb").stderr
     assert said.count("warning: tags 1, 2, 3, 4 were used more than 5 K outside") == 1
@@ -136,7 +136,7 @@ def test_delays_are_compared_at_one_temperature_or_not_at_all(tmp_path):
     known, hotter = fitted(WARM, 3), fitted(replace(WARM, start_c=35.0), 3, temperature="shared")
     assert hotter.temperatures[0].reference_c - known.temperatures[0].reference_c > 12
     assert calib.compare(known, hotter).same
-    # As they are stated, delays differ by 12 K of 5 mm/K: by 0.4 ns, and so do none of the shapes.
+    # As stated, delays differ by 12 K of 5 mm/K, 0.4 ns; the curves do not.
     blind = [replace(one, temperatures=()) for one in (known, hotter)]
     assert abs(calib.compare(*blind).offset_m) > abs(calib.compare(known, hotter).offset_m) + 0.1
     with pytest.raises(UnanswerableError, match=r"tags 1, 2.* slope over temperature in only one of the calibrations"):
@@ -153,7 +153,7 @@ def test_an_added_tag_shares_the_slope_of_the_others():
     with pytest.warns(TemperatureWarning):
         added = calib.add_tag(hot, known, 1).calibration
     assert added.temperatures == (replace(slope, tags=(2, 3, 4, 1)),)
-    # At 35 to 50 degrees, 15 K above the reference: without the slope the delay would be 0.5 ns shorter.
+    # At 35 to 50 degrees, 15 K above the reference: without the slope, the delay would be 0.5 ns shorter.
     assert added.delays_ns[1] == pytest.approx(whole.delays_ns[1], abs=0.06)
 
 
@@ -199,7 +199,7 @@ def test_the_c_header_tells_what_temperatures_add(tmp_path):
     for celsius in ((30.0, 24.5), (30.0, np.nan), (np.nan, np.nan)):
         seen = known.correct(*at, temperature_c=celsius)
         expected += [plain.range_m - seen.range_m, seen.sigma_total_m**2 - plain.sigma_total_m**2]
-    # Temperatures are kept in single precision: 2e-6 K of 30.
+    # Temperatures have single precision: 2e-6 K of 30.
     assert list(map(float, found)) == pytest.approx(expected, abs=1e-8, rel=1e-5)
 
 
@@ -219,7 +219,7 @@ def test_differences_of_arrival_are_corrected_for_the_temperature_of_their_targe
     known, tags = calib.fit(found, use="receptions").calibration, np.arange(6)
     readings = {"time_ns": 0 * tags, "tag": tags, "temperature_c": 20.0 + tags, "supply_v": tags * np.nan}
     warm = calib.load_ranges(replace(found, temperature=readings), use="receptions")
-    # A tag that is x longer in a range has a delay that is shorter by 2 x over the speed of light.
+    # A tag that adds x to a range has a delay that is smaller by 2 x over the speed of light.
     moved = {tag: known.delays_ns[tag] - 0.008 * tag / 0.299702547 for tag in known.delays_ns}
     slope = TemperatureSlope(tuple(tags.tolist()), 0.004, 0.0, 20.0, (10.0, 40.0))
     by_slope, by_delays = replace(known, temperatures=(slope,)), replace(known, delays_ns=moved)

@@ -1,4 +1,4 @@
-"""Plans of boards that stand still: what counting degrees of freedom says, and what a survey then finds."""
+"""Plans of boards that stand still, compared with counting degrees of freedom and with surveys."""
 
 import json
 import math
@@ -20,23 +20,23 @@ def given(boards, on="line", **settings):
 
 
 def in_orders(*orders):
-    """Arrangements on a line by the tags from its beginning on, a metre apart."""
+    """Return arrangements on a line by the order of their tags, a metre apart."""
     return surveys.planned(np.array([[[order.index(tag), 0, 0] for tag in sorted(order)] for order in orders], float))
 
 
 def information(inputs, one):
-    """Of the delays, in units of a pair's error."""
+    """Return the information on the delays, in units of a pair's error."""
     return delay_information(inputs, one)[0] * (0.02 / C_M_PER_NS) ** 2
 
 
 def test_boards_in_a_row_give_what_was_counted_by_hand():
-    """r12 + r23 - r13 is twice half the middle's delay: its variance is that of three pairs."""
+    """r12 + r23 - r13 is twice half of the middle board's delay: its variance is that of three pairs."""
     values, vectors = np.linalg.eigh(information(given(3), *in_orders((1, 2, 3))))
     assert np.count_nonzero(values > 1e-6 * values[-1]) == 1
     assert np.abs(vectors[:, -1]) == pytest.approx([0, 1, 0], abs=1e-9)
     assert values[-1] == pytest.approx(1 / 3)
-    # Four say of each board inside its own delay and nothing else. So eight orders, in which each of four stands inside
-    # four times, leave sqrt(2 / 4) of a pair's error, at best.
+    # Four boards determine the delay of each inner board and nothing else. So eight orders, in which each of four is an
+    # inner board four times, determine delays to sqrt(2 / 4) of a pair's error at best.
     assert information(given(4), *in_orders((3, 1, 4, 2))) == pytest.approx(np.diag([0.5, 0, 0, 0.5]), abs=1e-6)
 
 
@@ -49,9 +49,9 @@ def test_information_of_a_known_place_is_that_of_its_coordinates():
     ("boards", "on", "count", "each", "common"), [(4, "line", 8, 0.71, 0.35), (6, "plane", 10, 0.58, 0.24)]
 )
 def test_a_plan_promises_what_counting_says(boards, on, count, each, common):
-    """Random arrangements: 0.76 and 0.38 on a line, 0.78 and 0.30 in a plane; chosen ones are a little better."""
+    """Random arrangements: 0.76 and 0.38 on a line, 0.78 and 0.30 in a plane; chosen ones are slightly better."""
     found = calib.plan(boards, on=on, arrangements=count)
-    # Student's factor of the degrees of freedom, about 1.05, is in the intervals.
+    # Intervals include Student's factor of the degrees of freedom, about 1.05.
     unit = 1.96 * found.pair_error_m / C_M_PER_NS * 1.05
     assert np.sqrt(np.mean(np.square(list(found.half_ns.values())))) / unit == pytest.approx(each, rel=0.08)
     assert found.common_ns / unit == pytest.approx(common, rel=0.1)
@@ -87,7 +87,7 @@ def test_a_taped_distance_brings_what_it_is_said_to_bring():
     mean = math.sqrt(np.mean(np.square(list(with_it.half_ns.values()))))
     assert mean == pytest.approx(tape.mean_ns, rel=0.05)
     assert mean < tape.instead_of_ns
-    # It counts by its own sigma.
+    # It has the weight of its own sigma.
     common = [
         calib.plan(3, arrangements=2, taped=2, tape_sigma_m=sigma, pair_error_m=0.02).common_ns
         for sigma in (0.002, 0.02, 0.2)
@@ -149,14 +149,14 @@ def test_what_cannot_be_planned_is_refused(boards, settings, message):
 
 
 def test_three_in_a_row_say_nothing_where_one_of_their_pairs_is_mostly_reflected():
-    """All three are straight with 0.9^3 = 0.73 and 0.7^3 = 0.34; then the middle delay is what it always is."""
+    """All three pairs are direct with 0.9^3 = 0.73 and 0.7^3 = 0.34; then the middle delay is determined as usual."""
     row = in_orders((1, 2, 3))
     assert predict(given(3, reflected=0.1), row)[0].each[1] == pytest.approx(0.02 * math.sqrt(3) / C_M_PER_NS)
     assert np.isinf(predict(given(3, reflected=0.3), row)[0].each[1])
 
 
 def test_reflected_pairs_cost_what_their_loss_costs():
-    """Beside draws of one's own over the same arrangements: as if there were no such pairs."""
+    """Compared with draws over the same arrangements, in which reflected pairs are left out."""
     rng = np.random.default_rng(5)
     places = [places_of(rng, 6, 2, 4.0, 0.4) for _ in range(6)]
     of_draws = []
@@ -184,7 +184,7 @@ def test_reflected_pairs_cost_what_their_loss_costs():
 
 
 def test_a_curve_costs_what_a_process_of_its_size_costs(monkeypatch):
-    """The benchmark's own formula has the process itself where plan and survey have splines."""
+    """The formula of the benchmark has the process itself; plan and survey have splines."""
     monkeypatch.setattr(surveys, "power_dbm", lambda length: POWER_AT_1_M_DBM - 20 * math.log10(length))
     world = standing_boards(3, "plane", boards=5, arrangements=5, size_m=6.0, each=5)
     expected = surveys.promised(world, 2, PLANNED_CURVE_STD_M, 0.0)

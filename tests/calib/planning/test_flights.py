@@ -1,4 +1,4 @@
-"""Plans of flights: what counting says, what fits of flights then find, and what cannot be planned."""
+"""Plans of flights, compared with counting and with fits of flights; and plans that are refused."""
 
 import json
 import math
@@ -30,19 +30,19 @@ def planned(seen, *, noise_m=0.04, reflected=0.08, curve=True, force=None, **usa
 
 
 def mean_ns(seen, **given):
-    """Root mean variance of the delays."""
+    """Return the root mean variance of the delays."""
     return math.sqrt(np.mean(np.diag(planned(seen, **given).covariance_ns2)))
 
 
 def test_noise_alone_informs_by_its_inverse_variance_and_reflected_ranges_by_less():
     plain = ExpectedErrors(noise_m=0.05, reflected=0.0).informed()
     assert plain == pytest.approx(0.05**-2, rel=1e-3)
-    # A reflected range says nearly nothing; a few that pass for direct ones blur those.
+    # A reflected range has nearly no information; a few that look direct reduce the information of the direct ones.
     assert 0.6 * 0.7 * plain < ExpectedErrors(noise_m=0.05, reflected=0.3).informed() < 0.7 * plain
 
 
 def test_with_everything_known_a_plan_is_a_fit_with_known_distances():
-    """Positions known all along, exactly: the covariance is that of least squares on delays alone."""
+    """If all positions are known exactly, the covariance is that of least squares on delays alone."""
     given: Any = {"curve": False, "force_std_m_s2": None}
     seen = flight_of(
         flight(seconds=8.0),
@@ -59,7 +59,7 @@ def test_with_everything_known_a_plan_is_a_fit_with_known_distances():
 
 @pytest.mark.slow
 def test_what_a_fit_says_is_what_was_promised():
-    """One flight: the intervals of the fit, which estimates errors and smoothness, are within a fifth."""
+    """One flight: the intervals of the fit, which also estimates errors and smoothness, agree within a fifth."""
     seen = flight(seconds=12.0, seed=1, wander_deg=3.0, tilt_deg=1.0, place_noise_m=0.02)
     found = planned(seen, poses_until_s=6.0)
     fitted = calib.fit_from_ranges(seen, poses_until_s=6.0).calibration.delays_std_ns
@@ -83,7 +83,7 @@ def test_what_nothing_determines_is_named_and_what_would_is_ranked():
     assert [*told.values()] == sorted(told.values())
     elsewhere = next(what for what in told if what.startswith("the delay of tag"))
     tag = int(elsewhere.split()[4])
-    # 1.5 ns of every delay, and 0.05 ns of this one, are known.
+    # Every delay is known to 1.5 ns beforehand, and this one to 0.05 ns.
     guess = np.eye(6) / 1.5**2 + np.diag([0.05**-2 if one == tag else 0.0 for one in range(1, 7)])
     seen = rehearsed(robots=3, anchors=(), **short)
     left = np.trace(np.linalg.inv(np.linalg.inv(planned(seen, poses_until_s=0.0).covariance_ns2) + guess)) / 6
@@ -100,7 +100,7 @@ def test_sought_anchors_stay_open_and_given_ones_do_not():
 
 @pytest.fixture(scope="module")
 def base_ns():
-    """That of a flight of six seconds, of which positions are known for two."""
+    """Result for a flight of six seconds, of which positions are known for two."""
     return mean_ns(rehearsed(), poses_until_s=2.0)
 
 
@@ -123,7 +123,7 @@ def test_an_accelerometer_bridges_few_ranges_and_a_good_one_more():
     few: Any = {"rate_hz": 12.0, "seconds": 10.0}
     plan = calib.plan_flight(2, anchors=ANCHORS, imu="consumer", poses_until_s=4.0, **few)
     seen = rehearsed(**few, imu="consumer")
-    # A grade is the noise of a tenth of a second, and what propellers leave.
+    # A grade states the noise over a tenth of a second, and the effect of propellers.
     graded = 3 * math.hypot(3e-3 / math.sqrt(0.1), 0.2)
     good, poor, none = (mean_ns(seen, poses_until_s=4.0, force=force) for force in (0.02, graded, None))
     assert np.sqrt(np.mean(np.square(list(plan.open_ns.values())))) == pytest.approx(1.96 * poor, rel=1e-4)
@@ -132,7 +132,7 @@ def test_an_accelerometer_bridges_few_ranges_and_a_good_one_more():
 
 
 def test_trajectories_are_held_as_jerky_as_they_are_planned(monkeypatch):
-    """Beside third differences of the poses."""
+    """Compared with third differences of the poses."""
     seen = rehearsed(robots=3, anchors=(), rate_hz=20.0, seconds=16.0)
     time = seen.poses.time_ns[seen.poses.body == "robot1"] * 1e-9
     jerks = [
@@ -140,11 +140,11 @@ def test_trajectories_are_held_as_jerky_as_they_are_planned(monkeypatch):
         for k in (1, 2, 3)
     ]
     inside = (time[:-3] > 1.0) & (time[:-3] < 15.0)
-    # A spline with points 0.4 s apart takes off some of the quickest part.
+    # A spline with points 0.4 s apart removes some of the fastest part.
     jerk = planned(seen, poses_until_s=8.0).jerk_m_s3
     assert jerk == pytest.approx(math.sqrt(np.mean([j[inside] ** 2 for j in jerks])), rel=0.15)
-    # Where nothing holds them, trajectories of few ranges tell less; a curve that so few ranges cannot tell is held
-    # with a weight of 1e15, beside which nothing may be lost.
+    # Trajectories without other constraints have less information from few ranges; a curve that so few ranges do not
+    # determine is fixed by a weight of 1e15, and rounding must not spoil the rest.
     few = rehearsed(rate_hz=8.0, seconds=20.0)
     held = mean_ns(few, poses_until_s=5.0)
     monkeypatch.setattr(flights, "_jerk", lambda *_: 50.0)

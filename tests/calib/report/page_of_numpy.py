@@ -1,6 +1,6 @@
-"""What a report, an evaluation and exports must say, by NumPy and SciPy from exported tables: no code of the packages.
+"""Expected numbers of reports, evaluations and exports, by NumPy and SciPy from exported tables, without the packages.
 
-It follows docs/theory.md and the reference of a calibration's keys, and is here to disagree with them.
+It follows docs/theory.md and the reference of the keys of a calibration, as an independent check.
 """
 
 import csv
@@ -27,23 +27,23 @@ class Tables:
             self.tables.append([[unescape(cell).strip() for cell in row] for row in rows])
 
     def having(self, *cells):
-        """Return the one table in whose rows all of some cells stand."""
+        """Return the one table whose rows contain all of some cells."""
         found = [t for t in self.tables if all(any(cell in row for row in t) for cell in cells)]
         assert len(found) == 1, (cells, len(found))
         return found[0]
 
     def row(self, *cells):
-        """Return the row that begins with the first of some cells, of the table that has them all."""
+        """Return the row that starts with the first of some cells, of the table that has them all."""
         return next(row for row in self.having(*cells) if row[:1] == [cells[0]])
 
 
 def number(text):
-    """Return the number that a cell begins with."""
+    """Return the number at the start of a cell."""
     return float(text.split()[0].replace("−", "-").rstrip("%,;"))
 
 
 def columns(path):
-    """Return the exchanges of an exported table, as columns."""
+    """Return the exchanges of an exported table as columns."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     found = {name: [row[name] for row in rows] for name in rows[0]}
@@ -60,7 +60,7 @@ def curve(table, lifted):
 
 
 def beyond(table, lifted):
-    """How far the curve would go on beyond its range, straight on from the tenth at either end."""
+    """Return the linear extrapolation of a curve beyond its range, with the slopes of a tenth of the range."""
     low, high = table["range"]
     step = 0.1 * (high - low)
     a, b, c, d = curve(table, np.array([low, low + step, high - step, high]))
@@ -69,7 +69,7 @@ def beyond(table, lifted):
 
 
 class Corrected:
-    """Double-sided exchanges corrected by a calibration's JSON, and what is known of their errors."""
+    """Double-sided exchanges corrected by the JSON of a calibration, and their expected errors."""
 
     def __init__(self, table, known):
         e = columns(table)
@@ -139,7 +139,7 @@ class Corrected:
         return found | {"all": np.ones(len(self.pair), dtype=bool)}
 
     def of(self, rows):
-        """What an evaluation says of some rows, by the keys of its JSON."""
+        """Return the evaluation of some rows, by the keys of its JSON."""
         error = {name: (getattr(self, name) - self.truth)[rows] for name in STAGES}
         z2 = (error["full"] / self.sigma[rows]) ** 2
         raw_variance = np.mean((self.raw - self.truth - np.mean(self.raw - self.truth)) ** 2)

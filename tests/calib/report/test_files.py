@@ -1,4 +1,4 @@
-"""Reports, plans and figures as files: from Python and from commands, with sections of one's own, on paper."""
+"""Reports, plans and figures as files: from Python and from commands, with registered sections, and as PDF."""
 
 import io
 import json
@@ -48,7 +48,7 @@ def run(folder, *words, status=0):
 
 @pytest.fixture
 def sections(monkeypatch):
-    """The sections without figures, which take seconds to draw."""
+    """The sections without figures, whose drawing takes seconds."""
     few = {name: SECTIONS[name] for name in ("verdict", "warnings", "recordings", "determined", "provenance")}
     monkeypatch.setattr("calib.report.sections.SECTIONS", few)
     return few
@@ -73,7 +73,7 @@ def test_a_campaign_is_what_the_command_makes(folder, tmp_path, monkeypatch, sec
     assert repr(campaign).splitlines()[-1] == "judged on b.uwb"
     campaign = replace(campaign, origin=replace(campaign.origin, files={}))
     campaign.write(tmp_path / "python.html", progress=told.append)
-    # The time left follows from the share that is done, of the fit and the drawing together.
+    # The time left follows from the finished share of fit and drawing together.
     shares = [one for one in told if not isinstance(one, str)]
     assert (shares, shares[0], sum(share >= 0.65 for share in shares)) == (sorted(set(shares)), 0.0, 1)
     assert [one for one in told if isinstance(one, str)][4:] == ["drawing delays", "writing the page"]
@@ -83,7 +83,7 @@ def test_a_campaign_is_what_the_command_makes(folder, tmp_path, monkeypatch, sec
     assert json.loads(done.stdout) == json.loads(json.dumps(campaign.to_dict()))
     assert {path.name for path in (folder / "drawn").iterdir()} == {f"delays-{form}" for form in FORMS}
     made = [(tmp_path / "python.html").read_text(), (folder / "command.html").read_text()]
-    # When, by which command, and from which files is not the same.
+    # Time, command and files differ.
     texts = [re.sub(r"<p class='note'>Made.*?</p>|[0-9a-f]{12}|in memory", "", page) for page in made]
     assert len({text[: text.index(">Provenance</h2>")] for text in texts}) == 1
 
@@ -105,7 +105,7 @@ def test_ranges_alone_are_fitted_and_judged(campaign, tmp_path):
 
 
 def test_without_tests_errors_are_those_of_ranges_that_were_held_out(campaign, folder, tmp_path, sections):
-    """The fourth, seventh and last tenth of the time judge a fit to the others; delays are those of a fit to all."""
+    """The fourth, seventh and last tenth of the time evaluate a fit to the others; delays are those of a fit to all."""
     whole = calib.load_ranges(folder / "a.uwb")
     tenth = np.floor(10 * (whole.time_ns - whole.time_ns[0]) / (whole.time_ns[-1] - whole.time_ns[0]))
     held = np.isin(tenth, [3, 6, 9, 10])
@@ -120,7 +120,7 @@ def test_without_tests_errors_are_those_of_ranges_that_were_held_out(campaign, f
 
 
 def test_ranges_too_few_to_hold_out_are_judged_themselves(folder):
-    """Of the pair 1-3 there are ranges in the last tenth alone, which would be held out."""
+    """Pair 1-3 has ranges only in the last tenth, which would be held out."""
     whole = calib.load_ranges(folder / "a.uwb")
     late = whole.time_ns > whole.time_ns[0] + 0.9 * (whole.time_ns[-1] - whole.time_ns[0])
     few = whole[late | (whole.initiator + whole.target == 3)]
@@ -236,7 +236,7 @@ def test_a_plan_has_a_picture_of_each_arrangement_with_tapes_and_intervals(tmp_p
     page, files = (tmp_path / "plan.html").read_text(), {path.name for path in (tmp_path / "f").iterdir()}
     assert files == {f"{name}-{form}" for name in ("arrangement-A", "arrangement-B", "more") for form in FORMS}
     drawn = [words_of((tmp_path / "f" / f"arrangement-{name}-page.svg").read_text()) for name in "AB"]
-    # Once on the string, once below their bars.
+    # Once on the line, once below their bars.
     assert all(words.count(tag) == 2 for words in drawn for tag in ("7", "12", "3"))
     assert sum("distance to tape" in words for words in drawn) == 1
     assert "open" in drawn[0]
@@ -269,7 +269,7 @@ def table(rows, above=()):
     return Table(["pair", "mean"], [[f"row-{k}", "1.0"] for k in range(rows)], list(above), total=True)
 
 
-# So many lines that the table ends shortly below the page, begins shortly above its end, or has room enough.
+# Numbers of lines for which the table ends shortly below the page, begins shortly above its end, or fits.
 @pytest.mark.parametrize(("filled", "told"), [(18, []), (24, [Text("What the table shows.")]), (44, [])])
 def test_on_paper_a_table_is_not_parted_and_stands_below_its_heading(filled, told):
     lines = [Text(f"A line of text, the {k}th.") for k in range(filled)]

@@ -1,4 +1,4 @@
-"""Numbers of evaluations, reports and exports, parsed out of them, beside a computation of their own."""
+"""Numbers of evaluations, reports and exports, read from them and compared with a separate computation."""
 
 import csv
 import json
@@ -27,7 +27,7 @@ from uwblink.pages import figures
 
 DELAYS_NS = {"1": 0.31, "2": -0.24, "3": 0.12}
 MISSED_NS = {1: 0.31, 2: -0.24, 3: 0.42}
-"""What tags really have: the calibration's, but for tag 3, whose ranges it leaves too short."""
+"""True delays of tags: those of the calibration, except tag 3, whose corrected ranges are too short."""
 
 KNOTS = [0.1, 0.1, 0.1, 0.1, 0.9, 1.8, 1.8, 1.8, 1.8]
 KNOWN = {
@@ -67,7 +67,9 @@ KNOWN = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A flight whose pairs err differently, the worst one short, with more long outliers than short ones."""
+    """A flight whose pairs have different errors; the worst pair is too short, and there are more long outliers than
+    short.
+    """
     place = tmp_path_factory.mktemp("numbers")
     rng, n = np.random.default_rng(3), 3000
     pair = np.array([(1, 2), (3, 1), (2, 3)])[np.arange(n) % 3]
@@ -110,7 +112,7 @@ def same(found, expected, where=""):
         for key in expected:
             same(found[key], expected[key], f"{where}.{key}")
     else:
-        # Shares are counts over ranges: one that lies on a bound to the last digit may count on either side.
+        # Shares are counts over ranges: a range that is equal to a bound may count on either side.
         assert found == pytest.approx(expected, rel=1e-6, abs=1e-6), where
 
 
@@ -169,7 +171,7 @@ def test_the_verdict_has_the_numbers_that_it_rests_on(page, tables):
     assert [before, after, change] == pytest.approx([raw, full, 100 * (full / raw - 1)], abs=0.51)
     assert change < 0
     groups = {name: page.of(rows)["full"] for name, rows in page.groups().items() if name != "all"}
-    # Less what chance explains: Student's t times the standard error of a median, 1 % shared by all pairs.
+    # Minus the part that chance explains: Student's t times the standard error of a median, 1 % shared by all pairs.
     sure = {
         name: abs(of["median_m"]) / of["robust_std_m"] - 1.2533 * student.isf(0.005 / len(groups), n - 1) / n**0.5
         for name, of in groups.items()
@@ -226,7 +228,7 @@ def test_applied_ranges_are_what_the_definitions_say(folder, page):
 
 
 def to_program():
-    """Both registers by tag: 44 and 56 % of the delay's ticks on top of what was programmed."""
+    """Both registers by tag: 44 and 56 % of the delay's ticks added to the programmed ones."""
     found = {}
     for tag, delay in DELAYS_NS.items():
         ticks, before = -delay * 1e-9 / TICK_S, KNOWN["antenna_delays"][tag]
@@ -273,7 +275,7 @@ def test_the_errors_of_ros_yaml_are_what_the_model_says(folder, page):
     assert calib.load_calibration(folder / "c.json").errors is not None
 
 
-# The verdict on worlds of which it is known how they stand: judged on recordings, or made without known distances.
+# The verdict on worlds with known quality: evaluated on recordings, or made without known distances.
 
 
 CONTRADICTED = "Do the ranges agree with the known facts?"
@@ -361,7 +363,7 @@ def test_what_changed_since_makes_it_unfit(known, unseen, change, question, word
 
 
 def test_a_few_ranges_of_a_pair_do_not_make_it_unfit(known, unseen):
-    """Half a metre off in four ranges of a pair says little; in a hundred it is a fault."""
+    """Half a metre in four ranges of a pair is not significant; in a hundred it is a fault."""
     mine = np.flatnonzero((unseen.initiator + unseen.target == 10) & (abs(unseen.initiator - unseen.target) == 4))
     for count, mark in ((4, "✓ yes"), (100, "✗ no")):
         others = np.setdiff1d(np.arange(len(unseen)), mine[count:])
@@ -380,14 +382,14 @@ def test_few_powers_that_were_not_fitted_are_a_reservation(known, unseen):
 
 @pytest.fixture(scope="module")
 def surveyed():
-    """A survey of a string with one planted reflection."""
+    """A survey of boards on a line with one planted reflection."""
     r = standing_boards(31, boards=4, arrangements=6, pair_error_m=0.01).ranges
     hit = (r.time_ns < 65e9) & (r.initiator + r.target == 7) & (abs(r.initiator - r.target) == 1)
     return calib.survey(replace(r, raw_m=r.raw_m + 0.4 * hit), known="line")
 
 
 def grades(known: calib.Calibration) -> dict[str, str]:
-    """What is asked beside whether delays are known well enough, which is asked of all."""
+    """Return the grades of the criteria of surveys, without the general one on delays."""
     found = criteria(Results(calibration=known))
     return {one.question: one.grade for one in found if "antenna delays" not in one.question}
 

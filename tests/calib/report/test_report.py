@@ -1,4 +1,4 @@
-"""The report: one file that needs nothing else, and shows what it must."""
+"""The report: one file that needs no other file, with all of its content."""
 
 import hashlib
 import json
@@ -75,7 +75,7 @@ def sizes_of_drawing(text):
 
 
 def fonts_of(resources, seen):
-    """Yield the kind of every font below some resources, forms included."""
+    """Yield the kind of every font in some resources, forms included."""
     for font in (resources.get("/Font") or {}).values():
         for one in [font.get_object(), *(d.get_object() for d in font.get_object().get("/DescendantFonts", []))]:
             yield one["/Subtype"]
@@ -102,7 +102,7 @@ def test_the_pdf_has_numbered_pages_an_outline_and_figures_that_are_drawings(cam
         kinds |= set(fonts_of(page["/Resources"], set()))
         assert f"{number} / {len(reader.pages)}" in texts[-1]
     assert min(sizes) >= 7.99, "no text is smaller than 8 pt"
-    # Outlines that printers take: type 42; type 3 is refused by publishers.
+    # Outlines that printers accept: type 42; publishers refuse type 3.
     assert kinds <= {"/Type0", "/CIDFontType2", "/TrueType"}
     whole = "\n".join(texts)
     assert "lifted power" in whole, "the words inside a figure are words"
@@ -159,7 +159,7 @@ def test_planted_delays_stand_beside_fitted_ones(campaign):
 
 
 def test_a_campaign_s_tables_have_the_numbers_of_its_test(campaign):
-    """Shares beyond three sigmas by side, and what filters gain, which must not change sign on its way to the page."""
+    """Shares beyond three sigma by side, and the gains of filters, whose signs must be those of the page."""
     run("calib", "fit", "train.uwb", "-o", "same.json", cwd=campaign)
     run("uwblink", "export", f"{TEST}.uwb", "--to", "csv", "-o", "csv", cwd=campaign)
     page = page_of_numpy.corrected(campaign / "csv" / "exchanges.csv", campaign / "same.json")
@@ -182,7 +182,7 @@ def test_a_campaign_s_tables_have_the_numbers_of_its_test(campaign):
     text = re.sub(r"<[^>]*>", "", (campaign / "r.html").read_text())
     told = re.search(r"the mean NIS is .*? pass the gate", text, re.DOTALL)[0]
     nis, one, _, low, high, _, nees, three, nees_low, nees_high, *_ = map(float, re.findall(r"\d+(?:\.\d+)?", told))
-    # Bounds of a mean of squares lie about what is expected of it: one of a range, three of a position.
+    # Bounds of a mean square are about its expectation: one of a range, three of a position.
     assert (one, three) == (1, 3)
     assert low < 1 < high < 2 < nees_low < 3 < nees_high
     assert 0 < nis < 10

@@ -1,4 +1,4 @@
-"""Boards in the order that is said: exchanged labels are named, right ones are not, and what cannot be told is said."""
+"""Stated orders of boards: exchanged labels are named, correct ones are not, and ambiguous ones are stated."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ FIVE = standing_boards(4, boards=5, arrangements=5, reflected=0.05, each=20)
 
 
 def said_with(world, exchange=None):
-    """What is known: the line, and the true orders but for labels (arrangement, one, other) that are exchanged."""
+    """Return the known facts: the line, and the true orders except for exchanged labels (arrangement, one, other)."""
     orders = orders_of(world, None)[0]
     for name, one, other in exchange or ():
         swap = {one: other, other: one}
@@ -26,7 +26,7 @@ def said_with(world, exchange=None):
 
 @pytest.fixture(scope="module")
 def right():
-    """The survey with the right orders."""
+    """The survey with the correct orders."""
     return calib.survey(FIVE.ranges, known=said_with(FIVE))
 
 
@@ -41,7 +41,7 @@ def test_right_orders_from_either_end_are_not_spoken_against(right):
 def test_exchanged_labels_are_named_and_the_ranges_are_believed(right):
     order = orders_of(FIVE, None)[0]["3"]
     pair = f"{min(order[:2])} and {max(order[:2])}"
-    # Those that are exchanged in all arrangements are one mistake.
+    # Labels that are exchanged in all arrangements are one mistake.
     for wrong, text in (
         ([("3", *order[:2])], f"3: boards {pair} are exchanged: the stated order"),
         ([(str(k), 2, 5) for k in range(1, 6)], "1, 2, 3, 4, 5: boards 2 and 5 "),
@@ -58,7 +58,7 @@ def test_an_exchange_that_is_another_one_from_the_other_end_names_both():
     assert exchanged_boards((1, 3, 2, 4), places) == set()
     assert exchanged_boards((1, 3, 2, 4), places[[0, 2, 1, 3]]) == {(2, 3), (1, 4)}
     assert exchanged_boards((1, 3, 2, 4), places[[1, 0, 2, 3]]) == {(1, 3)}
-    # Boards nearer than 10 cm stand in either order.
+    # Boards nearer than 10 cm may have either order.
     ways = ([0.0, 1.0, 0.95, 2.0], [2.0, 0.95, 1.0, 0.0], [0.0, 1.0, 0.85, 2.0])
     assert [is_in_order(np.array(coordinates)) for coordinates in ways] == [True, True, False]
 

@@ -1,4 +1,4 @@
-"""Reflected pairs: what a search thinks of them against likelihoods written out, and planted ones."""
+"""Reflected pairs: the search compared with explicit likelihoods, and planted reflections."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -22,7 +22,7 @@ PAIR_M, CURVE_M = 0.02, 0.03
 
 @pytest.fixture(scope="module")
 def linear():
-    """Marks of three arrangements on a line, none set, and how unlikely marks are by the likelihood written out."""
+    """Return marks of three arrangements on a line, none set, and a function for the explicit likelihood of marks."""
     world = standing_boards(11, boards=4, arrangements=3, reflected=0.12)
     knowledge = calib.Knowledge(shape="line")
     network = network_of(read_surveys(world.ranges, knowledge), knowledge, {}, curve=False)
@@ -40,7 +40,7 @@ def linear():
         share = betaln(1 + count, 30 + rows - count) - betaln(1, 30)
         covariance, away = np.diag(own) + spread, seen - 0.3 * marks
         back = np.linalg.inv(covariance)
-        # No detour is shorter than the straight way, but for a gross error in a hundred.
+        # No detour is shorter than the direct path, except for a gross error in a hundred.
         hit = marks > 0
         detour, std = 0.3 + 0.25**2 * (back @ away)[hit], np.sqrt(0.25**2 - 0.25**4 * np.diag(back)[hit])
         longer = np.log((ndtr(detour / std) + 0.01) / (ndtr(0.3 / 0.25) + 0.01)).sum()
@@ -54,7 +54,7 @@ def test_the_search_and_the_weights_are_those_of_the_likelihood_written_out(line
     marks = none.search()
     assert marks.any()
     here = unlikely(marks)
-    # No change of two rows is likelier.
+    # No change of two rows is more likely.
     for rows in [*combinations(range(len(marks)), 1), *combinations(range(len(marks)), 2)]:
         other = marks.copy()
         other[list(rows)] ^= True
@@ -63,12 +63,12 @@ def test_the_search_and_the_weights_are_those_of_the_likelihood_written_out(line
     assert len(weight) > 3
     value = np.array([unlikely(marks) for marks in found])
     expected = np.exp(-0.5 * (value - value.min()))
-    # The covariance written out has numbers from 1e-4 to 1e6.
+    # The explicit covariance has numbers from 1e-4 to 1e6.
     assert weight == pytest.approx(expected / expected.sum(), rel=5e-3)
 
 
 def reflected(world, arrangement, first, second, longer_m):
-    """Ranges of a world in which one pair of an arrangement is longer."""
+    """Return ranges of a world in which one pair of an arrangement is longer."""
     r = world.ranges
     there = (r.time_ns >= 70e9 * arrangement) & (r.time_ns < 70e9 * (arrangement + 1) - 5e9)
     hit = there & (np.sort(np.column_stack([r.initiator, r.target]), axis=1) == sorted([first, second])).all(axis=1)
@@ -90,7 +90,7 @@ def test_planted_reflections_are_named_and_delays_are_as_good_as_without():
     assert not any(one.chance > 0.5 for one in clean.reflected)
     for tag, delay in world.delays_ns.items():
         assert abs(result.calibration.delays_ns[tag] - delay) < 3 * result.calibration.delays_std_ns[tag]
-        # 5 of 70 rows count no longer: a little wider, and as near.
+        # 5 of 70 rows have no weight: intervals are slightly wider, and errors equal.
         assert result.calibration.delays_std_ns[tag] < 1.5 * clean.calibration.delays_std_ns[tag]
         assert abs(result.calibration.delays_ns[tag] - clean.calibration.delays_ns[tag]) < 0.08
     assert len(result.calibration.provenance["reflected"]) == len(result.reflected)
@@ -109,7 +109,7 @@ def test_what_cannot_be_told_is_said_and_widens():
     world = standing_boards(5, boards=3, arrangements=6, pair_error_m=0.01)
     longer = reflected(world, 1, 1, 2, 0.4)
     result = calib.survey(replace(world.ranges, raw_m=world.ranges.raw_m + longer), known="line")
-    # Of three boards on a line, any of the three ranges may be the wrong one, longer or too short.
+    # For three boards on a line, any of the three ranges may be the wrong one, too long or too short.
     assert len([(one.first, one.second) for one in result.reflected if one.arrangement == "2"]) > 1
     assert any(text.startswith("may also be reflected: ") for text in result.warnings)
     clean = calib.survey(world.ranges, known="line").calibration

@@ -1,4 +1,4 @@
-"""Surveys of boards that stand still: planted delays and places, what is not determined, and what is said wrongly."""
+"""Surveys of boards that stand still: planted delays and positions, undetermined ones, and wrong known facts."""
 
 import json
 import math
@@ -25,7 +25,7 @@ from uwblink.recording.schema import KnownDistance, load_places
 
 
 def in_order(*orders):
-    """Places on a line (boards, 3) by the order in which boards lie, at uneven steps."""
+    """Return positions on a line (boards, 3) in a given order of boards, with uneven steps."""
     steps = np.array([0.0, 0.9, 2.1, 3.6])
     found = []
     for order in orders:
@@ -44,14 +44,14 @@ def scores(result, planted):
 
 
 def test_without_noise_delays_and_places_are_exact():
-    """And delays count by the weights of either end: 0.7 of the lower tag's, 0.3 of the other one's."""
+    """Delays have the weights of either end: 0.7 for the lower tag, 0.3 for the other one."""
     world = standing_boards(1, places=FOUR[:4], pair_error_m=0.0, noise_m=0.0)
     r, delay = world.ranges, np.array([0.0, *world.delays_ns.values()])
     low, high, count = np.minimum(r.initiator, r.target), np.maximum(r.initiator, r.target), np.ones(len(r))
     raw = r.raw_m - SPEED_OF_LIGHT * 0.2e-9 * (delay[low] - delay[high])
     weights: Any = {"weight_initiator": 0.7 * count, "weight_target": 0.3 * count}
     result = calib.survey(replace(r, initiator=low, target=high, raw_m=raw, **weights), known="line")
-    # A tenth of a millimetre, 3e-4 ns: in ranges without noise, too, one may be reflected by less than its noise.
+    # A tenth of a millimetre, 3e-4 ns: also in ranges without noise, one may be reflected by less than its noise.
     assert result.calibration.delays_ns == pytest.approx(world.delays_ns, abs=3e-4)
     for k, one in enumerate(result.arrangements):
         found = np.array([board.position_m[0] for board in one.boards])
@@ -88,7 +88,7 @@ def test_intervals_of_delays_and_places_hold_in_the_stated_frame():
             away = np.array(board.position_m[:2]) - truth[n]
             cov = board.covariance_m2[:2, :2] + 1e-12 * np.eye(2)
             inside.append(float(away @ np.linalg.solve(cov, away)) < 5.99)
-    assert np.mean(inside) > 0.8  # of 15, those of one arrangement dependent
+    assert np.mean(inside) > 0.8  # of 15, and those of one arrangement are dependent
 
 
 def test_three_boards_in_a_row_give_the_delay_of_the_middle_one_alone_until_distances_are_taped():
@@ -119,7 +119,7 @@ def test_a_curve_over_power_is_found_along_with_the_delays():
     curve = result.calibration.bias_curve
     assert float(curve(np.array([1.0]))[0]) == pytest.approx(0.0, abs=2e-3)
     assert max(map(abs, scores(result, world.delays_ns).values())) < 3.5
-    # -77 dBm at a metre: from 0.4 m (-69) to 9 m (-96) the planted curve rises by 11 cm.
+    # -77 dBm at a metre: from 0.4 m (-69) to 9 m (-96), the planted curve increases by 11 cm.
     low, high = curve.range
     assert float(curve(np.array([low]))[0] - curve(np.array([high]))[0]) > 0.05
 
@@ -182,7 +182,7 @@ def test_a_distance_said_of_all_arrangements_is_one_reading():
     taped = tuple(KnownDistance(i, i + 1, d, 0.02) for i, d in ((1, 0.9), (2, 1.2)))
     spans = {str(k): (70.0 * k, 70.0 * k + 60) for k in range(4)}
     found = calib.survey(world.ranges, known=calib.Knowledge(shape="line", spans_s=spans, distances=taped)).calibration
-    # r12 tells delays 1 and 2 together to 2 cm, thus to 0.13 ns; delay 2 is that of the middle.
+    # r12 determines delays 1 and 2 together to 2 cm, 0.13 ns; delay 2 is that of the middle board.
     assert found.delays_std_ns[1] == pytest.approx(2 * 0.02 / 0.2997, rel=0.25)
 
 
@@ -196,7 +196,7 @@ def test_a_position_said_of_all_arrangements_is_one_reading():
             shape="plane", spans_s=spans, positions=tuple(calib.KnownPosition(t, p, 0.02) for t, p in at.items())
         )
         stds.append(calib.survey(world.ranges, known=known, pair_error_m=1e-4).verdict.std[0])
-    # The same places four times are no better known.
+    # The same positions four times are not known better.
     assert stds[1] == pytest.approx(stds[0], rel=0.1)
 
 
@@ -213,7 +213,7 @@ def test_errors_that_last_within_an_arrangement_widen_intervals():
 
 def test_few_arrangements_widen_intervals_by_students_quantile():
     result = calib.survey(standing_boards(5, boards=3, arrangements=3).ranges, known="line")
-    # What is known of pairs' errors beforehand counts as three degrees of freedom (docs/theory.md).
+    # The prior of the pair error counts as three degrees of freedom (docs/theory.md).
     wider = student.ppf(0.975, result.calibration.provenance["rests_on"]["freedom"] + 3) / norm.ppf(0.975)
     assert wider > 1.05
     found = [result.calibration.delays_std_ns[t] for t in sorted(result.calibration.delays_ns)]
@@ -250,7 +250,7 @@ def test_a_board_that_was_moved_is_named(moved):
 
 
 def wrong_labels():
-    """Six boards on a table, the places of four of which are known, with the names of two exchanged."""
+    """Six boards on a table with four known positions, and the labels of two exchanged."""
     world = standing_boards(8, "plane", boards=6, arrangements=3, pair_error_m=0.01)
     names, where = {1: 2, 2: 1}, world.places[0]
     said = tuple(calib.KnownPosition(names.get(t, t), tuple(where[t - 1].tolist()), 0.01, "1") for t in range(1, 5))
@@ -258,7 +258,7 @@ def wrong_labels():
 
 
 def wrong_tape():
-    """A taped distance that is 30 cm off, beside one that is right."""
+    """A measured distance that is 30 cm off, and one that is right."""
     said = (KnownDistance(1, 3, 2.1 + 0.3, 0.005, "1"), KnownDistance(2, 4, 2.7, 0.005, "1"))
     world, text = (
         standing_boards(9, places=FOUR[:5], pair_error_m=0.01),
@@ -360,7 +360,7 @@ def test_arguments_that_cannot_be_used_are_refused(settings, message):
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """The arrangements of the sample, each a recording of its own with its mark."""
+    """The arrangements of the sample, each as a recording with its mark."""
     folder, ranges = tmp_path_factory.mktemp("sample"), calib.sample_arrangements(4)
     for k in range(4):
         r = ranges[ranges.time_ns // 40_000_000_000 == k]
@@ -393,7 +393,7 @@ def test_the_command_takes_a_recording_an_arrangement_and_writes_what_others_rea
     assert std[0] == 0
     assert std[1:] == pytest.approx([std[1]] * 3, rel=0.8)
     assert sorted(load_places(anchors)[1]) == [1, 2, 3, 4]
-    # A corrected recording comes of it as of any other calibration.
+    # It makes a corrected recording like any other calibration.
     assert calib.apply(recording[0], known, tmp_path / "corrected.uwb").count == 600
 
 
@@ -404,7 +404,7 @@ def test_places_are_written_for_ros_and_as_a_picture(surveyed, tmp_path):
     assert "ids: [1, 2, 3, 4]" in text
     assert text.count("covariance: [") == 4
     result.save_picture(tmp_path / "places.svg")
-    # A panel each.
+    # One panel each.
     assert (tmp_path / "places.svg").read_text().count('id="axes_') == 4
     for write, name, message in (
         (result.save_anchors, "b.yaml", "there are A, B, C, D"),
@@ -430,7 +430,7 @@ def test_two_arrangements_of_one_name_are_refused_by_flags_that_the_command_has(
 
 
 def test_a_curve_is_taken_over_where_powers_do_not_vary():
-    # Boards some 2.5 m apart: powers within 3 dB, and a bias of several cm that delays would swallow.
+    # Boards about 2.5 m apart: powers within 3 dB, and a bias of several cm that delays would absorb.
     corners = np.array([[0.0, 0.0, 0.0], [2.3, 0.0, 0.0], [1.1, 2.1, 0.0], [1.2, 0.7, 1.9]])
     near = [corners, corners[[1, 2, 3, 0]]]
     wide = [0.6 * near[0], 3.0 * near[1]]
@@ -446,7 +446,7 @@ def test_a_curve_is_taken_over_where_powers_do_not_vary():
     def world(places):
         return standing_boards(8, boards=4, places=places, bias_size_m=0.1, pair_error_m=0.005)
 
-    # The same boards' curve, from a survey in which distances vary and are known.
+    # The curve of the same boards, from a survey in which distances vary and are known.
     known = calib.survey(world(wide).ranges, known=taped(wide)).calibration
     assert not known.bias_curve.flat
     ranges, planted = world(near).ranges, world(near).delays_ns
@@ -456,7 +456,7 @@ def test_a_curve_is_taken_over_where_powers_do_not_vary():
     off = [np.mean([c.delays_ns[t] - planted[t] for t in planted]) for c in (alone, result.calibration)]
     assert abs(off[1]) < 0.5 * abs(off[0])
     assert max(map(abs, scores(result, planted).values())) < 3.5
-    # The curve's own errors are in the intervals.
+    # Intervals include the errors of the curve.
     sure = calib.survey(ranges, known=taped(near), curve_from=replace(known, uncertainty=None)).calibration
     assert all(sure.delays_std_ns[t] < result.calibration.delays_std_ns[t] for t in planted)
 

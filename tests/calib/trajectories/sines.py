@@ -1,4 +1,4 @@
-"""Flights for tests: bodies on sums of sines, ranges by plain geometry. Nothing here is shared with what is tested."""
+"""Flights for tests: bodies on sums of sines, ranges by geometry, without code that is tested."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,7 +19,7 @@ PAIRS = np.array([(1, 3), (2, 5), (4, 6), (1, 4), (2, 6), (3, 5), (1, 5), (2, 3)
 
 
 def place(body, t):
-    """Metres (n, 3) of body 0, 1 or 2 at seconds (n,): two sines an axis about a middle of its own."""
+    """Return positions (n, 3) in metres of body 0, 1 or 2 at seconds (n,): two sines per axis about its own centre."""
     rng = np.random.default_rng(100 + body)
     period, phase = rng.uniform(4.0, 11.0, (3, 2)), rng.uniform(0, 2 * np.pi, (3, 2))
     middle = [2.2 * np.cos(2.1 * body), 2.2 * np.sin(2.1 * body), 1.2 + 0.2 * body]
@@ -28,23 +28,23 @@ def place(body, t):
 
 
 def since_takeoff(t, standing_s):
-    """Seconds of flight (n,) at seconds (n,) of which bodies stand still for the first; they start gently."""
+    """Return seconds of flight (n,) at seconds (n,); bodies stand still at first and start gently."""
     flown = np.maximum(t - standing_s, 0.0)
     return flown - 0.8 * (1 - np.exp(-flown / 0.8)) if standing_s else t
 
 
 def shake(body, t, size_m, rate_hz):
-    """Metres (n, 3): a body shaken along all axes, each at its own rate about the given one."""
+    """Return displacements (n, 3) in metres of a body that is shaken along all axes, at rates about the given one."""
     return size_m * np.sin(2 * np.pi * rate_hz * t[:, None] * np.array([1.0, 1.13, 0.91]) + body)
 
 
 def heading(body, t):
-    """Radians (n,)."""
+    """Return headings (n,) in radians."""
     return body + 1.2 * np.sin(2 * np.pi * t / (13.0 + 2 * body))
 
 
 def turn(angle, vector):
-    """Turn a vector (3,) about the vertical by angles (n,)."""
+    """Rotate a vector (3,) about the vertical by angles (n,)."""
     c, s = np.cos(angle), np.sin(angle)
     return np.column_stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1], np.full_like(c, vector[2])])
 
@@ -54,7 +54,7 @@ def arm(tag, length_m=ARM):
 
 
 def scores(result):
-    """Return errors of delays over their covariance's standard errors, of the tags on moving bodies."""
+    """Return errors of delays divided by the standard errors of their covariance, for tags on moving bodies."""
     found = result.calibration
     std = dict(zip(found.uncertainty.tags, np.sqrt(np.diag(found.uncertainty.delays_ns2)), strict=True))
     return np.array([(found.delays_ns[tag] - delay) / std[tag] for tag, delay in DELAYS_NS.items()])
@@ -73,7 +73,7 @@ class Flight:
 
 
 def turned_anchor(tag):
-    """How an anchor stands: turned about all axes, each in its own way."""
+    """Return the attitude of an anchor: rotated about all axes, differently for each."""
     return Rotation.from_euler("ZYX", [1.1 * tag, 0.4, -0.3])
 
 
@@ -99,15 +99,15 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
     late_m=None,
     blocked=None,
 ):
-    """A flight whose poses have noise in places, and headings and tilts that are off by sines of so many degrees.
+    """Return a flight whose poses have noise in positions, and headings and tilts with errors that are sines of some
+    degrees.
 
-    `anchors` (k, 3) are the antennas of standing bodies, tags 11 and on, with delays of their own; they range with
-    each tag in turn. With
-    `height_off_m` bodies read their heights, wrong by that and by 3 cm of noise; for `standing_s` all stand.
-    `shaken` bodies move beside by so many metres, so many times a second; ranges of a pair in `late_m` are too long.
-    Most ranges of a pair are half a metre too long in spells of two seconds, together with those of the same two bodies
-    where `blocked` are "bodies", or on their own with "pairs".
-    `antennas(tags, seconds)` of the flight says where antennas are.
+    `anchors` (k, 3) are the antennas of standing bodies, tags 11 and on, with their own delays; they range with each
+    tag in turn. With `height_off_m`, bodies read their heights with this error and 3 cm of noise; during `standing_s`
+    all stand still. `shaken` bodies also oscillate by some metres, some times a second; ranges of pairs in `late_m` are
+    too long. If `blocked` is "bodies", most ranges between two bodies are half a metre too long in spells of two
+    seconds; if it is "pairs", each pair has its own spells. `antennas(tags, seconds)` of the flight returns positions
+    of antennas.
     """
     rng = np.random.default_rng(seed)
     n = int(seconds * rate)
@@ -163,7 +163,7 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
     half = REPLY * TICK_S / 2
     tags = [Tag(tag, f"robot{(tag - 1) // 2}", tuple(arm(tag, arm_m))) for tag in DELAYS_NS]
     tags += [Tag(tag, f"anchor{tag}", tuple(MAST)) for tag in stand]
-    # Poses say where bodies are; ranges belong to the middle of their first two messages, which `half` is.
+    # Ranges belong to the middle of their first two messages, `half` later than their time.
     when = np.arange(0.0, seconds + 1.0, 0.02)
     poses_of: list[Any] = []
     for body in range(3):
@@ -172,7 +172,7 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
         yaw = heading(body, flown) + off
         upright = np.column_stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)])
         tilt = np.radians(tilt_deg) * np.sin(2 * np.pi * when / (11.0 + body) + body)
-        # Tilted about the world's x axis: the quaternion of the tilt times that of the heading.
+        # Tilted about the x axis of the world: the quaternion of the tilt times that of the heading.
         s, c = np.sin(tilt / 2), np.cos(tilt / 2)
         upright = np.column_stack([s * upright[:, 3], -s * upright[:, 2], c * upright[:, 2], c * upright[:, 3]])
         seen = place(body, flown) + shake(body, flown, *shaken) + place_noise_m * rng.normal(size=(len(when), 3))
@@ -194,7 +194,7 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
 
 
 def heights(rng, when, flown, off_m):
-    """The columns of a recording's table of height readings, 50 a second of each body."""
+    """Return the columns of a recording's table of height readings, 50 per second of each body."""
     read = [place(body, flown)[:, 2] + off_m + 0.03 * rng.normal(size=len(flown)) for body in range(3)]
     names = np.repeat([f"robot{body}" for body in range(3)], len(when))
     return {

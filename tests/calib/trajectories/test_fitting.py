@@ -1,4 +1,4 @@
-"""Delays planted in flights whose distances nobody knows: sums of sines, seen by their ranges alone after a while."""
+"""Delays planted in flights without true distances: sums of sines, with positions known at the start only."""
 
 from dataclasses import replace
 from typing import Any
@@ -33,9 +33,9 @@ def test_planted_delays_are_found_from_a_known_start(flown):
     result = calib.fit_from_ranges(flown, poses_until_s=8.0, progress=shares.append)
     std = np.array(list(result.calibration.delays_std_ns.values()))
     assert result.success
-    # A sound flight has no warning but that it is short.
+    # A sound flight has only the warning that it is short.
     assert [warning[:12] for warning in result.warnings] == ["only 14 s of"]
-    # One flight of 14 s: a fit with all distances known leaves 18 ps.
+    # One flight of 14 s: a fit with all distances known has an error of 18 ps.
     assert np.abs(scores(result)).max() < 3.5
     assert 0.015 < std.max() < 0.06
     away = distance_errors(result, flown)
@@ -44,7 +44,7 @@ def test_planted_delays_are_found_from_a_known_start(flown):
     known = result.calibration.provenance
     assert (known["truth"], known["rests_on"]["known_s"]) == ("ranges", pytest.approx(7.9, abs=0.11))
     assert known["rests_on"]["moving"] == ["robot0", "robot1", "robot2"]
-    # The standard error that is stated is that of the errors.
+    # The stated standard error agrees with the errors.
     assert known["distance_std_m"] == pytest.approx(np.std(away), rel=0.5)
     assert (shares, shares[-1]) == (sorted(shares), 1.0)
 
@@ -63,7 +63,7 @@ def test_ranges_of_a_flight_that_are_worked_on_in_several_pieces_give_the_same_d
 def test_it_corrects_ranges_of_another_flight_as_any_calibration(known):
     other = flight(seed=9)
     applied = known.apply(calib.load_ranges(other))
-    # Reflected ranges aside, what is left of the bias is far below that of raw ones.
+    # Without reflected ranges, the remaining bias is far below that of raw ranges.
     assert abs(np.median(applied.corrected_m - other.distance_m)) < 0.012
     assert abs(np.median(applied.raw_m - other.distance_m)) > 0.012
 
@@ -108,7 +108,7 @@ def test_nearly_exact_ranges_give_nearly_exact_delays():
 def test_positions_of_anchors_replace_a_known_start():
     flown = flight(seconds=10.0, rate=120, anchors=ANCHORS)
     result = calib.fit_from_ranges(flown, poses_until_s=0.0)
-    # Lever arms of anchors are 37 cm long, each turned another way.
+    # Lever arms of anchors are 37 cm long, each with another direction.
     assert np.std(distance_errors(result, flown)) < 0.03
     std = np.sqrt(np.diag(result.calibration.uncertainty.delays_ns2))
     assert result.calibration.provenance["rests_on"]["known_s"] == 0
@@ -121,7 +121,7 @@ def test_sought_anchors_do_not_spoil_what_a_known_start_tells():
     flown = flight(seconds=10.0, rate=120, anchors=ANCHORS, seed=2)
     result = calib.fit_from_ranges(flown, poses_until_s=6.0, anchors="sought")
     assert np.abs(scores(result)).max() < 3.5
-    # Where an anchor is and how late it answers are nearly the same from a flight in the middle of the room.
+    # In a flight in the middle of the room, an anchor's position and its delay have nearly the same effect.
     assert all(np.isinf(result.calibration.delays_std_ns[tag]) for tag in (11, 12, 13, 14))
     assert "tags 11, 12, 13, 14" in result.warnings[0]
     assert result.calibration.provenance["rests_on"]["anchors_sought"] == [f"anchor{tag}" for tag in (11, 12, 13, 14)]
@@ -129,8 +129,8 @@ def test_sought_anchors_do_not_spoil_what_a_known_start_tells():
 
 @pytest.mark.slow
 def test_noise_is_not_smaller_by_what_paths_take_of_few_ranges():
-    # 960 ranges, of which paths take an eighth: noise has a standard error of 2.5 %, the mean of three one of 1.4 %.
-    # By residuals alone it would be 6 % too small.
+    # 960 ranges, of whose degrees of freedom paths use an eighth: noise has a standard error of 2.5 %, the mean of
+    # three one of 1.4 %. By residuals alone it would be 6 % too small.
     found = [
         calib.fit_from_ranges(flight(seed=seed, rate=40), minimum_norm=True, poses_until_s=8.0, between_m=0.0)
         for seed in (61, 62, 63)

@@ -1,4 +1,6 @@
-"""What is known beside ranges and poses, tapes and heights; and flights that are not what a fit takes them for."""
+"""Known facts in addition to ranges and poses, such as measured distances and heights; and flights that contradict
+them.
+"""
 
 import re
 from dataclasses import replace
@@ -50,7 +52,7 @@ def test_a_tape_tells_what_delays_have_in_common_and_without_it_the_interval_is_
     )
     result = calib.fit_from_ranges(flown, distances=[by_tape(flown, 1, 3)], **given)
     error, std = common(result)
-    # 26 ranges of the pair while both stood, of 4 cm each and some of them reflected, leave 0.1 ns of both delays.
+    # 26 ranges of the pair while both stood still, with 4 cm each and some reflected, leave 0.1 ns of both delays.
     assert std < 0.15
     assert abs(error) < 3 * std
     truth = flown.distance_m[np.searchsorted(flown.exchanges.time_ns, result.ranges.time_ns)]
@@ -60,12 +62,12 @@ def test_a_tape_tells_what_delays_have_in_common_and_without_it_the_interval_is_
 
 def test_a_tape_that_was_misread_is_named_and_others_are_not():
     flown = flight(seconds=8.0, standing_s=4.0)
-    # Nothing says when the bodies of a distance without an arrangement stood still.
+    # A distance without an arrangement does not state when the bodies stood still.
     tapes = [by_tape(flown, 1, 3, 0.3), by_tape(flown, 2, 5), KnownDistance(2, 3, 2.0, 0.02)]
     result = calib.fit_from_ranges(flown, distances=tapes, **KNOWN_START)
     (named,) = [warning for warning in result.warnings if "measure it again" in warning]
     told = re.match(r"the distance of tags 1 and 3, 3\.952 m, is ([\d.]+) .* more than ", named)
-    # Thirty centimetres, as far as 16 ranges of the pair and known places of 2 cm tell.
+    # Thirty centimetres, within the accuracy of 16 ranges of the pair and known positions of 2 cm.
     assert 25 < float(told[1]) < 35
     assert [text for text in result.warnings if "tags 2 and 3 is not used" in text]
     assert result.calibration.provenance["rests_on"]["distances"] == 2
@@ -116,7 +118,7 @@ def test_heights_tell_on_which_side_of_anchors_in_one_plane_bodies_are():
     flown = flight(seconds=6.0, rate=120, anchors=CEILING, height_off_m=0.05, arm_m=0.0)
     given: dict[str, Any] = {"poses_until_s": 0.0, "attitudes": "none", "minimum_norm": True}
     without = calib.fit_from_ranges(flown, heights="ignored", **given)
-    # A sensor that sees a table for a while counts less then, and readings that are not numbers not at all.
+    # Readings of a sensor above a table get less weight for that time, and those that are not numbers none.
     read, time_s = flown.height["height_m"], flown.height["time_ns"] * 1e-9
     read[(time_s > 2.0) & (time_s < 2.4)] -= 0.7
     read[::97] = np.nan
@@ -155,7 +157,7 @@ def test_walls_between_bodies_are_named_and_in_the_intervals(between_m):
     found = result.calibration
     errors = [found.delays_ns[int(tag)] - delay for tag, delay in flown.planted["delays_ns"].items()]
     assert np.abs(np.array(errors) / list(found.delays_std_ns.values())).max() < 2.5
-    # Walls of 5 cm put delays off by some 100 ps; without them they are known to half of that.
+    # Walls of 5 cm shift delays by about 100 ps; without them they are known to half of that.
     assert (np.max(np.abs(errors)) > 0.08) == (between_m > 0)
 
 
@@ -179,7 +181,7 @@ def flown(tmp_path_factory):
 
 
 def joint_scores(found, flown):
-    """Differences from a fit with all of the motion capture over joint standard errors, of all boards."""
+    """Return differences from a fit with all of the motion capture divided by joint standard errors, of all boards."""
     whole = calib.fit(flown, loss="cauchy").calibration
     std = np.sqrt(np.diag(found.uncertainty.delays_ns2))
     tags = found.uncertainty.tags
@@ -192,7 +194,7 @@ def test_ten_seconds_of_motion_capture_an_imu_and_heights_follow_a_real_flight(f
     found = calib.fit_from_ranges(flown, poses_until_s=10.0, attitudes="imu")
     truth = calib.load_ranges(flown)
     away = found.ranges.truth_m - truth.truth_m[np.searchsorted(truth.time_ns, found.ranges.time_ns)]
-    # Four ranges a second for three robots: accelerometer and height bridge what is between them.
+    # Four ranges per second for three robots: accelerometer and height determine the motion between them.
     assert abs(np.median(away)) < 0.03
     assert np.median(np.abs(away)) < 0.1
     assert sum(map(np.isfinite, found.calibration.delays_std_ns.values())) >= 10
@@ -213,7 +215,7 @@ def test_anchors_alone_leave_the_delays_open_and_intervals_say_how_far(flown):
 def test_tags_that_range_with_anchors_only_leave_delays_open_whatever_the_skews_of_clocks():
     flown = uwbsim.simulate(uwbsim.load("anchors_and_tag/bipartite", {"run.duration_s": 10.0}))
     given: dict[str, Any] = {"poses_until_s": 6.0, "delays_only": True}
-    # What all delays have in common is not determined, either, and no number is given for it.
+    # The common part of all delays is not determined, either, and no value is given.
     words = r"ranges between two sides are known to ± [4-6] cm"
     with pytest.raises(calib.UnanswerableError, match=words) as raised:
         calib.fit_from_ranges(flown, **given)
@@ -225,7 +227,7 @@ def test_tags_that_range_with_anchors_only_leave_delays_open_whatever_the_skews_
     assert of_tags == pytest.approx(sum(found.delays_ns.values()) - of_tags, abs=0.01)
 
 
-# Attitudes out of gyroscopes, and a fit that has nothing else: flights of the simulator, which shares none of it.
+# Attitudes from gyroscopes, and a fit without other attitudes: flights of the simulator, which shares no code with it.
 
 
 BOXES = {"a": ([-2.6, -2.6, 0.4], [-0.4, -0.2, 2.6]), "b": ([0.4, -2.6, 0.4], [2.6, -0.2, 2.6])}
@@ -270,7 +272,8 @@ def test_attitudes_by_gyroscope_stay_near_those_of_motion_capture(flown_with_imu
             wander_rad=np.zeros(3),
         )
         off = (scene.attitudes[body].at(time) * true.at(time).inv()).as_rotvec()
-        # A bias of half a degree a second would be 5 degrees off after ten; it is told from the first four seconds.
+        # A bias of half a degree per second would cause 5 degrees after ten; it is determined from the first four
+        # seconds.
         assert np.degrees(np.abs(off)).max() < 3.5
     assert np.mean(scene.inertial["a"].force_m_s2, axis=0) == pytest.approx([0, 0, 9.81], abs=0.5)
 
@@ -284,7 +287,7 @@ def test_a_heading_that_is_wrong_by_a_right_angle_is_found_over_the_flight(flown
         turns = [turned.attitudes[body].at(TWO_S) * known.attitudes[body].at(TWO_S).inv() for body in BOXES]
         return np.array([turn.as_euler("ZYX")[0, 0] for turn in turns])
 
-    # Integrated from an unknown heading; "b" is put a right angle off, where a first window may have left it.
+    # Integrated from an unknown heading; that of "b" starts a right angle off, as after a wrong first window.
     scene = scene.turned_by(dict(zip(BOXES, (-off(scene) + [0.0, np.pi / 2]).tolist(), strict=True)))
     scene = replace(scene, attitudes={**scene.attitudes, "a": replace(scene.attitudes["a"], heading_known=True)})
     state = interpolated(known.places, np.arange(0.0, 4.0, 0.1), 2).state(scene, np.zeros((0, 3)))
@@ -298,7 +301,7 @@ def test_inertial_readings_and_anchors_are_enough(flown_with_imus):
     found = calib.fit_from_ranges(flown_with_imus, poses_until_s=0.0, attitudes="imu")
     truth = calib.load_ranges(flown_with_imus)
     away = found.ranges.truth_m - truth.truth_m[np.searchsorted(truth.time_ns, found.ranges.time_ns)]
-    # Neither a place nor a heading of a robot was given.
+    # No position and no heading of a robot is given.
     assert np.std(away) < 0.03
     assert abs(np.mean(away)) < 0.01
     planted = np.array([flown_with_imus.planted["delays_ns"][str(tag)] for tag in found.calibration.delays_ns])

@@ -1,4 +1,4 @@
-"""Motion as unknowns: distances and what is known, by finite differences."""
+"""Motion as unknowns: derivatives of distances and known facts, compared with finite differences."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ CEILING = [[3.5, 3.5, 2.6], [-3.5, 3.5, 2.6], [-3.5, -3.5, 2.6], [3.5, -3.5, 2.6
 
 
 def readings(flown):
-    """Return inertial readings of robot0, at rest but for what a sine shakes it."""
+    """Return inertial readings of robot0, which is at rest except for a sine."""
     time_s = np.arange(0.0, 4.0, 0.01)
     wave = np.sin(5 * time_s)
     columns = {f"w{axis}": 0.1 * wave for axis in "xyz"} | {"ax": wave, "ay": 0.5 * wave, "az": 9.81 + 0 * wave}
@@ -34,7 +34,7 @@ def laid_out():
     motion = Motion.of(scene)
     layout = Layout(motion.unknowns({}, 8.0))
     x = 3 * np.random.default_rng(2).normal(size=layout.size)
-    # Turns are linear to first order only: at 1e-4 rad to a ten-thousandth of a lever arm.
+    # Rotations are linear to first order only: at 1e-4 rad to a ten-thousandth of a lever arm.
     x[layout.where["turn"]] *= 1e-4
     return scene, motion, layout, x
 
