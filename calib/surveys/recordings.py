@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.data.ranges import Ranges, concatenate
-from calib.data.sources import Data, antenna_delays_of, each, opened
+from calib.data.sources import Data, antenna_delays_of, each, fingerprint_of, opened, refuse_repeated
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.optimize import LONGER, maximize
 from calib.estimator.range_model import RangeModel
@@ -101,6 +101,7 @@ def read_surveys(data: Data | Iterable[Data], knowledge: Knowledge) -> SurveyDat
             findings += find_motion(one.name, ranges[rows])
             arrangements[one.name] = one
     whole = concatenate([ranges for ranges, _, _ in recordings])
+    refuse_repeated(whole.recordings)
     means, few = pair_means(whole, np.concatenate(numbers))
     return SurveyData(
         means=means,
@@ -116,11 +117,13 @@ def read_surveys(data: Data | Iterable[Data], knowledge: Knowledge) -> SurveyDat
 def _load(data: Data) -> tuple[Ranges, list[Arrangement], list[KnownDistance]]:
     """Return the possible ranges of a recording, without true distances, and its other contents."""
     if isinstance(data, Ranges):
-        return replace(data, truth_m=np.zeros(len(data))).usable(need_power=False), [], []
+        # Parts of one recording have the same fingerprint.
+        return replace(data, truth_m=np.zeros(len(data)), recordings=()).usable(need_power=False), [], []
     with opened(data) as (name, source):
         exchanges = single_reports(source.exchanges).exchanges
         delays, truth = antenna_delays_of(source, name), np.zeros(len(exchanges))
         ranges = Ranges.from_exchanges(exchanges, truth, source=name, antenna_delays=delays)
+        ranges = replace(ranges, recordings=((name, fingerprint_of(exchanges)),))
         marked, stated = getattr(source, "arrangements", ()), getattr(source, "known_distances", ())
         return ranges.usable(need_power=False), list(marked), list(stated)
 
