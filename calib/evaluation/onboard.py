@@ -368,6 +368,9 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
     def nanoseconds(seconds: Any) -> Ints:
         return one.began_ns + np.rint(np.array(seconds) * 1e9).astype(np.int64)
 
+    delays, changes = known.delays.estimates(), running.changes
+    if running.drift[best]:
+        delays = known.delays.estimates(running.state[best, changes], running.covariance[best, changes, changes])
     times, places, attitudes, covariances = zip(*states, strict=True)
     heard_s, nis, accepted, drifts = zip(*updates, strict=True)
     time_ns, place, covariance = nanoseconds(times), np.array(places), np.array(covariances)
@@ -399,7 +402,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         accepted=np.array(accepted),
         drifts=np.array(drifts),
         restarts_s=tuple(restarts),
-        delays=running.delays_at((best,), known.delays, drift=running.drift[best]),
+        delays=delays,
     )
 
 
