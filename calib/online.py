@@ -323,7 +323,7 @@ class RangeUpdate:
 
 def ends_of(ranges: Ranges) -> Ints:
     """Return the tags (n, 2) on whose delays ranges, and then their arrivals, depend."""
-    ends, heard = np.column_stack([ranges.initiator, ranges.target]), ranges.arrivals
+    ends, heard = ranges.ends, ranges.arrivals
     return ends if heard is None else np.concatenate([ends, ends[heard.exchange]])
 
 

@@ -6,10 +6,20 @@ from typing import Final
 
 import numpy as np
 from scipy import ndimage
+from scipy.special import stdtrit
 
 from uwblink.arrays import Floats, Ints
 
-__all__ = ["SIGMA_OF_MAD", "STD_OF_MEDIAN", "TWO_SIDED_95", "less_medians", "medians", "robust_spread", "spreads"]
+__all__ = [
+    "SIGMA_OF_MAD",
+    "STD_OF_MEDIAN",
+    "TWO_SIDED_95",
+    "less_medians",
+    "medians",
+    "robust_spread",
+    "spreads",
+    "students_factor",
+]
 
 TWO_SIDED_95: Final = 1.959963984540054
 """Standard deviations about the mean that contain 95 % of a normal distribution."""
@@ -19,6 +29,11 @@ SIGMA_OF_MAD: Final = 1.4826
 
 STD_OF_MEDIAN: Final = 1.2533
 """Standard error of a median over that of a mean, of normal values: the root of pi/2."""
+
+
+def students_factor(freedom: float) -> float:
+    """Return the ratio of the 95 % intervals of Student's t with so many degrees of freedom and of a normal value."""
+    return float(stdtrit(freedom, 0.975)) / TWO_SIDED_95
 
 
 def robust_spread(values: Floats, centre: float | None = None) -> float:

@@ -349,7 +349,7 @@ def _persistence(ranges: Ranges, values: Floats, least: float = 0.0) -> tuple[fl
 
     The autocovariance is averaged in bins of the logarithm of the lag; bins with few products are left out.
     """
-    pairs = pairs_of(ranges.initiator, ranges.target)
+    pairs = ranges.pairs
     pair = ranges.session * np.int64(len(pairs.ends)) + pairs.number
     order = np.lexsort((ranges.time_ns, pair))
     pair, time_s, away = pair[order], ranges.time_ns[order] * 1e-9, values[order]

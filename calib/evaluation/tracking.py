@@ -175,7 +175,7 @@ class Measurements(ColumnTable):
     @property
     def same_exchange(self) -> Bools:
         """Which measurements (n,) are of the same exchange as the one before."""
-        return np.diff(self.exchange, prepend=-1) == 0
+        return np.asarray(np.diff(self.exchange, prepend=-1) == 0)
 
     @property
     def heard(self) -> Bools:
@@ -277,7 +277,7 @@ def ranges_about(ranges: Ranges, tags: Sequence[int]) -> Ranges:
 
 def distances_in(ranges: Ranges) -> tuple[Ints, Floats, Ints]:
     """Return the tags (n, k, 2) and signs (n, k) of the distances in ranges and arrivals, and exchanges (n,)."""
-    ends, exchange, heard = np.column_stack([ranges.initiator, ranges.target]), np.arange(len(ranges)), ranges.arrivals
+    ends, exchange, heard = ranges.ends, np.arange(len(ranges)), ranges.arrivals
     if heard is None and not ranges.differences.any():
         return ends[:, None], np.ones((len(ranges), 1)), exchange
     listener = ranges.listener
