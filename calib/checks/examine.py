@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from calib.checks import columns, geometry, residuals
 from calib.checks.recording_view import RecordingView, view_of
-from calib.data.sources import Data, each, opened
+from calib.data.sources import Data, each, fingerprint_of, opened, refuse_repeated
 from calib.errors import UnanswerableError
 from calib.findings import BUDGET, CERTAIN, OF_A_FIT, REMEDIES, Candidate, Check, Finding
 from calib.surveys.knowledge import Knowledge
@@ -425,16 +425,19 @@ def examine(data: Data | Iterable[Data]) -> list[Finding]:
     of those, which are then also compared with each other; `Ranges` are not enough. Recordings of arrangements without
     poses are surveyed together. Impossible rows are left out before the other checks, and consequences of a more
     serious fault are not reported. Of a longer recording about 160,000 exchanges are examined, in 40 stretches over all
-    of its time. Raises the errors of `Recording.open`.
+    of its time. Raises the errors of `Recording.open`, and `BadInputError` if two recordings hold the same exchanges.
 
     >>> import calib
     >>> [finding.fault for finding in calib.examine(calib.sample_flight())]
     []
     """
     recordings, views, findings = each(data), list[RecordingView](), list[Finding]()
+    contents = list[tuple[str, str]]()
     for one in recordings:
         with opened(one) as (name, source):
             whole = view_of(name, source)
+        contents += [(name, fingerprint_of(whole.exchanges))] if len(whole.exchanges) else []
+        refuse_repeated(contents)
         found, view = _examine_recording(whole)
         prefix = f"{name}: " if len(recordings) > 1 else ""
         findings += [replace(finding, evidence=prefix + finding.evidence) for finding in found]

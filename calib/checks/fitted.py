@@ -99,7 +99,7 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
     """
     model, ranges, count = found.model, found.model.ranges, len(found.model.ranges)
     tags = [f"tag {tag}" for tag in model.tags]
-    ends = np.searchsorted(model.tags, model.pairs.ends)[model.pairs.number]
+    ends = model.pairs.among(model.tags)
 
     def of_tags(kind: str, derivative: Floats) -> Family:
         return Family(kind=kind, names=tags, derivative=Derivative(ends, derivative, len(tags)))

@@ -18,7 +18,6 @@ from calib.data.ranges import NO_STAMPS, STATIC, Ranges, growth_fault, look_like
 from calib.errors import UnanswerableError
 from calib.estimator.known_distances import KnownDistances
 from calib.findings import SMALLEST_NS, Finding, warning
-from calib.pairs import pairs_of
 from calib.spread import STD_OF_MEDIAN, TWO_SIDED_95, medians, robust_spread, spreads
 from uwblink.arrays import Floats
 from uwblink.protocols.table import is_single_sided
@@ -70,7 +69,7 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
     if model.curve is None:
         yield _without_curve(found, ranges, residuals_m)
     if fixed and set(model.tags) <= set(fixed):
-        apart_m = float(np.ptp(medians(residuals_m, pairs_of(ranges.initiator, ranges.target).number)))
+        apart_m = float(np.ptp(medians(residuals_m, ranges.pairs.number)))
         yield warning(
             "given delays",
             f"curve only: the delays are the given ones; a common error of the delays is in the curve, and their "
@@ -149,7 +148,7 @@ def dependence_on_initiator(ranges: Ranges) -> Iterator[Finding]:
 
     Medians of raw errors show it even if a fit takes such ranges for reflections.
     """
-    ways = _medians_by_way(ranges.raw_m - ranges.truth_m, ranges)
+    ways = _medians_by_way(ranges.error_m, ranges)
     # Standard errors are for independent ranges. In the simulator's room, errors that last make variances of sums up to
     # 15 times as large, so eight of these standard errors are about two, and more is not by chance.
     differ_m = {

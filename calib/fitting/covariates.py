@@ -32,7 +32,7 @@ from calib.estimator.score_tests import Derivative, Family, Tested
 from calib.estimator.time_blocks import Persistence
 from calib.findings import REMEDIES, Finding, warning
 from calib.settings import FitSettings
-from calib.spread import TWO_SIDED_95, robust_spread
+from calib.spread import TWO_SIDED_95, robust_spread, students_factor
 from uwblink.arrays import Floats
 from uwblink.display import first_few
 
@@ -161,7 +161,7 @@ def _as_lasting(tested: Tested, known: Persistence) -> Tested:
     Alternatives that follow a pattern differ from block to block, and the errors in their sums last less.
     """
     longest = max(known, tested.lasting, key=lambda one: one.factor)
-    factor = longest.factor / tested.lasting.factor * (known.quantile95 / TWO_SIDED_95) ** 2
+    factor = longest.factor / tested.lasting.factor * students_factor(known.freedom) ** 2
     return replace(tested, covariance=factor * tested.covariance, lasting=longest)
 
 
@@ -175,9 +175,8 @@ def _beside_power(plain: KnownDistances, covariate: Covariate, kind: str) -> Tes
     names, columns, values = covariate.entries(kind, plain.model.pairs)
     tags, pairs, count = plain.model.tags, plain.model.pairs, len(values)
     rank = np.linspace(-1, 1, count)[np.argsort(np.argsort(plain.model.lifted, kind="stable"))]
-    ends = np.searchsorted(tags, pairs.ends)[pairs.number] + len(names)
     derivative = Derivative(
-        np.concatenate([columns, ends], axis=1),
+        np.concatenate([columns, pairs.among(tags) + len(names)], axis=1),
         np.concatenate([-values, rank[:, None], rank[:, None]], axis=1),
         len(names) + len(tags),
     )
@@ -192,18 +191,17 @@ def with_new_tag(calibration: Calibration, tag: int, ranges: Ranges) -> Calibrat
     others share, if errors scatter less with it; else one that is unknown and as large as theirs, so that total sigmas
     contain it.
     """
-    if np.isfinite(ranges.temperature_c[np.column_stack([ranges.initiator, ranges.target]) == tag]).all():
+    if np.isfinite(ranges.temperature_c[ranges.ends == tag]).all():
         slopes = [replace(o, tags=(*o.tags, tag)) if len(o.tags) > 1 else o for o in calibration.temperatures]
         calibration = replace(calibration, temperatures=tuple(slopes))
     patterns = calibration.patterns
     if tag not in ranges.turning or not patterns:
         return calibration
-    ends = np.stack([ranges.initiator, ranges.target], axis=1)
     variance = np.mean([np.square(one.coefficients_m) + np.diag(one.covariance_m2) for one in patterns])
     unknown = Pattern(
         tags=(tag,),
         coefficients_m=(0.0,) * HARMONICS,
-        centre=tuple(np.nanmean(harmonics(ranges.toward[ends == tag]), axis=0).tolist()),
+        centre=tuple(np.nanmean(harmonics(ranges.toward[ranges.ends == tag]), axis=0).tolist()),
         covariance_m2=tuple(map(tuple, (variance * np.eye(HARMONICS)).tolist())),
         rms_m=math.sqrt(np.mean([one.rms_m**2 for one in patterns])),
     )
@@ -295,8 +293,7 @@ def drift_of(found: KnownDistances) -> dict[str, Any]:
     fitted = layout.indices(["offset of tag in session"])
     if not (len(fitted) and of_host_clock(int(ranges.time_ns.min()))):
         return {}
-    ends = np.searchsorted(tags, pairs.ends)[pairs.number]
-    offsets = Derivative(ends * count + ranges.session[:, None], np.ones((1, 1)), len(tags) * count)
+    offsets = Derivative(pairs.among(tags) * count + ranges.session[:, None], np.ones((1, 1)), len(tags) * count)
     tested = found.slopes.test(Family(kind="session", names=(), derivative=offsets, fitted=fitted))
     # What lasts within a session is in the offsets of its pairs, whose variance the information contains.
     tested = replace(tested, total=tested.total + tested.pulled, covariance=0.0 * tested.covariance)

@@ -225,7 +225,7 @@ def _ranges_of_new_tag(calibration: Calibration, tag: int, ranges: Ranges) -> Ra
             f"{MIN_OF_DELAY} are needed"
         )
     directed = [one for pattern in calibration.patterns for one in pattern.tags]
-    blind = np.isnan(some.toward).any(axis=2) & np.isin(np.stack([some.initiator, some.target], axis=1), directed)
+    blind = np.isnan(some.toward).any(axis=2) & np.isin(some.ends, directed)
     some = some[np.flatnonzero(~blind.any(axis=1))]
     if len(some) < MIN_OF_DELAY:
         raise UnanswerableError(
@@ -330,7 +330,7 @@ def result_of(
         "converged": found.success,
         "standard_errors": f"sandwich over {found.persistence.stretches:.0f} independent stretches of time",
         **for_provenance(findings),
-        "error_std_m": {"raw": float(np.std(ranges.raw_m - ranges.truth_m)), "corrected": float(np.std(residuals))},
+        "error_std_m": {"raw": float(np.std(ranges.error_m)), "corrected": float(np.std(residuals))},
     }
     if fixed:
         provenance["fixed_ns"] = {str(tag): delay for tag, delay in sorted(fixed.items())}

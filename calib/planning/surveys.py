@@ -25,7 +25,7 @@ from calib.planning.settings import ROOMS_M, SurveyPlanSettings
 from calib.spread import TWO_SIDED_95
 from calib.surveys.knowledge import KnownPosition
 from calib.surveys.network import Boards, Case, CurvePrior, Linear, Network
-from calib.surveys.outcome import students_factor, verdict_on_delays
+from calib.surveys.outcome import interval_factor, verdict_on_delays
 from calib.surveys.recordings import PairMeans
 from uwblink.arrays import Bools, Floats
 from uwblink.recording.schema import KnownDistance
@@ -39,7 +39,7 @@ POWER_AT_1_M_DBM = -74.0
 whose median is -77 dBm."""
 
 
-def random_arrangements(inputs: SurveyPlanSettings, count: int, tries: int = 400) -> list[PlannedArrangement]:
+def random_arrangements(inputs: SurveyPlanSettings, count: int) -> list[PlannedArrangement]:
     """Return random arrangements: orders on a line at even steps, random places on a table or in a room.
 
     Fewer than `count` where a line has fewer orders, or a room too little space. Anchors stay where the first one has
@@ -50,7 +50,7 @@ def random_arrangements(inputs: SurveyPlanSettings, count: int, tries: int = 400
     if inputs.on == "line" and inputs.size_m is None:
         size = np.maximum(size, 0.8 * (len(tags) - 1))
     found: dict[tuple[int, ...] | int, PlannedArrangement] = {}
-    for number in range(tries):
+    for number in range(400):
         if len(found) == count:
             break
         key: tuple[int, ...] | int = number
@@ -253,4 +253,4 @@ def _interval(inputs: SurveyPlanSettings, chosen: Sequence[PlannedArrangement]) 
     rows, unknown = math.comb(boards, 2), boards * dimensions - motions
     known = len(inputs.anchors) * dimensions
     left = sum(rows + len(one.taped) + known - min(unknown, rows) for one in chosen)
-    return TWO_SIDED_95 * students_factor(max(left - boards, 0.0))
+    return TWO_SIDED_95 * interval_factor(max(left - boards, 0.0))

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
 
 import uwblink
 from calib.calibration.model import Calibration, Uncertainty, matrix_of
@@ -18,7 +17,7 @@ from calib.estimator.range_model import METRES_A_NS
 from calib.findings import Finding, for_provenance, warning
 from calib.information import InformationColumn, Verdict, judge, reduced
 from calib.settings import SurveySettings
-from calib.spread import TWO_SIDED_95
+from calib.spread import students_factor
 from calib.surveys.network import Boards
 from calib.surveys.recordings import LIFT, SurveyData
 from calib.surveys.result import (
@@ -34,12 +33,12 @@ from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
 
-def students_factor(freedom: float) -> float:
-    """Return the ratio of Student's 95 % quantile to the normal one, because the spread of errors is estimated.
+def interval_factor(freedom: float) -> float:
+    """Return the factor of intervals, because the spread of errors is estimated with so many degrees of freedom.
 
     Its prior counts as a few degrees of freedom.
     """
-    return float(stdtrit(max(freedom + PAIR_PRIOR_FREEDOM, 1.0), 0.975)) / TWO_SIDED_95
+    return students_factor(max(freedom + PAIR_PRIOR_FREEDOM, 1.0))
 
 
 def verdict_on_delays(information: Floats, tags: Sequence[int]) -> Verdict:
@@ -143,7 +142,7 @@ def _calibration(
     """Return the calibration: delays that are determined, the curve, their uncertainty and provenance."""
     network, known, freedom = found.network, verdict.determined, found.freedom
     tags = [tag for tag, good in zip(network.tags, known.tolist(), strict=True) if good]
-    covariance = students_factor(freedom) ** 2 * verdict.covariance[np.ix_(known, known)]
+    covariance = interval_factor(freedom) ** 2 * verdict.covariance[np.ix_(known, known)]
     std = dict(zip(tags, np.sqrt(np.diag(covariance)).tolist(), strict=True)) | dict.fromkeys(network.fixed_ns, 0.0)
     delays = dict(zip(network.tags, found.delays.tolist(), strict=True)) | network.fixed_ns
     noise = float(np.sqrt(np.average(network.means.noise_m**2, weights=network.means.count)))
@@ -159,7 +158,7 @@ def _calibration(
         where, knots = network.layout.where["curve"], network.curve.knots
         span = (float(knots[0]), float(knots[-1]))
         curve = Curve(tuple(knots.tolist()), tuple(found.x[where].tolist()), DEGREE, span)
-        curve_covariance = found.covariance()[where, where] * students_factor(freedom) ** 2
+        curve_covariance = found.covariance()[where, where] * interval_factor(freedom) ** 2
         gauge = f"the bias curve is zero at {ALPHA_DBM:g} dBm; the delays contain the common constant"
     fixed = {"fixed_ns": {str(tag): delay for tag, delay in sorted(network.fixed_ns.items())}}
     provenance = (fixed if network.fixed_ns else {}) | {
@@ -248,7 +247,7 @@ def _frame(points: Floats, boards: Boards) -> tuple[Floats, list[int], str]:
 def _arrangement(found: Solution, number: int) -> SurveyedArrangement:
     """Return the places of boards in an arrangement, in the frame of known positions or of its first boards."""
     network, boards, seats = found.network, found.network.arrangements[number], found.network.seats(number)
-    points, covariance = network.positions_m(found.x), found.covariance() * students_factor(found.freedom) ** 2
+    points, covariance = network.positions_m(found.x), found.covariance() * interval_factor(found.freedom) ** 2
     own = [slice(3 * seat, 3 * seat + 3) for seat in seats.tolist()]
     surveyed = tuple(
         SurveyedBoard(tag, (x, y, z), covariance[one, one], bool(np.trace(covariance[one, one]) < 1.0))

@@ -15,6 +15,7 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 import calib
+import uwblink
 from benchmarks.standing import standing_boards
 from calib.cli.commands import app
 from calib.data.samples import ANCHOR_DELAYS_NS, stamped
@@ -427,6 +428,16 @@ def test_two_arrangements_of_one_name_are_refused_by_flags_that_the_command_has(
     commands: Any = typer.main.get_command(app)
     options = {option for one in commands.commands["survey"].params for option in one.opts}
     assert set(re.findall(r"--[a-z-]+", told)) <= options
+
+
+def test_a_recording_that_is_given_twice_is_refused_under_any_name(recording, tmp_path):
+    with uwblink.Recording.open(recording[0]) as one:
+        unmarked = Contents(exchanges=one.exchanges())
+    paths = [tmp_path / name for name in ("one.uwb", "other.uwb")]
+    for path in paths:
+        unmarked.save(path)
+    with pytest.raises(calib.BadInputError, match=r"^other\.uwb: contains the same exchanges as one\.uwb"):
+        calib.survey(paths)
 
 
 def test_a_curve_is_taken_over_where_powers_do_not_vary():
