@@ -1,7 +1,8 @@
 """The model of ranges besides their distances: delays, curves over power, offsets, and parameters of errors.
 
-`RangeModel.of` makes unknowns and parts of these for any ranges. Fits to known distances, surveys and flights share it,
-and differ only in the source of distances.
+`RangeModel.of` makes the unknowns and the parts of ranges from them. Fits to known distances and flights without them
+share it and differ only in the source of distances. Surveys use it for the mean ranges of pairs, from which
+`calib.surveys.network` estimates positions and delays.
 """
 
 from __future__ import annotations
