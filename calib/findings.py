@@ -24,8 +24,12 @@ BUDGET: Final = 0.01
 (Bonferroni)."""
 
 OF_A_FIT: Final = BUDGET / 2
-"""Share of sound fits with at least one false finding, over all alternatives. The other half of the budget belongs to
-the checks of the recording."""
+"""Share of sound fits with at least one false finding, over all tests. The other half of the budget belongs to the
+checks of the recording."""
+
+FIT_LEVELS: Final = {"offsets": 0.6 * OF_A_FIT, "reflections": 0.2 * OF_A_FIT, "places": 0.2 * OF_A_FIT}
+"""Parts of `OF_A_FIT`. Offsets have most, because small ones matter; shares of reflections and errors of places that
+matter have far smaller p-values."""
 
 SMALLEST_NS: Final = 0.02
 """Smallest error of a delay that is a finding: 3 mm of a range."""

@@ -24,7 +24,7 @@ from calib.estimator.range_rows import Mixture
 from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, search, widening
 from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
-from calib.findings import NAMED_DETOUR_M, OF_A_FIT, SMALLEST_NS, Finding, either, warning
+from calib.findings import FIT_LEVELS, NAMED_DETOUR_M, SMALLEST_NS, Finding, either, warning
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -65,7 +65,7 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[Finding]]:
         tested = [*(one.with_fitted([-1]).combined(np.eye(len(one.total))[:-1]) for one in tested), noise]
     if found.slopes_of_heard is not None:
         tested += found.slopes_of_heard.tests(list(_of_heard(found)))
-    findings = _without_explained(search(tested, OF_A_FIT))
+    findings = _without_explained(search(tested, FIT_LEVELS["offsets"]))
     plain = found.covariances["delay"]
     for one in tested:
         if one.family.kind in ("pair", "session") and not len(one.family.fitted):
@@ -278,7 +278,7 @@ def _largest_shift(finding: FoundOffset, covariance: Floats) -> float:
     return float(np.max(np.abs(finding.effects_ns) / std, initial=0.0))
 
 
-KINDS = {
+OFFSET_FAULTS = {
     "pair": (
         "offset of a pair",
         "{whose}: ranges are {size} too {way} compared with the other pairs, which changes {worst}",
@@ -337,8 +337,10 @@ def finding_of(offset: FoundOffset) -> Finding:
         "own": own,
         "others": others,
     }
-    names = [name for name in offset.names if name in KINDS] if offset.kind == "shared" else [offset.kind]
-    return either([warning(KINDS[name][0], KINDS[name][1].format(**words), offset.p_value) for name in names])
+    names = [name for name in offset.names if name in OFFSET_FAULTS] if offset.kind == "shared" else [offset.kind]
+    return either(
+        [warning(OFFSET_FAULTS[name][0], OFFSET_FAULTS[name][1].format(**words), offset.p_value) for name in names]
+    )
 
 
 def _like_noise(found: Finding) -> bool:
@@ -367,7 +369,7 @@ def _reflections(found: KnownDistances) -> Iterator[Finding]:
     detour_m = np.exp(values["least detour"]) + np.exp(values["detour level"] + values["detour of pair"])
     share, far = expit(odds), detour_m > NAMED_DETOUR_M
     p_values = np.minimum(len(ends) * ndtr(-odds / np.sqrt(variance)), 1.0)
-    most = p_values < OF_A_FIT
+    most = p_values < FIT_LEVELS["reflections"]
     hidden, tags = np.flatnonzero((share > HIDDEN) & far & most).tolist(), found.model.tags
     for number in hidden:
         a, b = ends[number].tolist()

@@ -25,9 +25,6 @@ from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import names_in
 
-WITHOUT_CURVE: Final = "no curve"
-"""The name of the finding of fits without a curve."""
-
 LOUD_M: Final = 0.5
 """Maximum spread of errors of UWB ranges: noise is 3 to 10 cm, and mean detours of published flights are 0.1 to 0.5 m
 (MILUV, STAR-loc)."""
@@ -88,7 +85,7 @@ def _without_curve(found: KnownDistances, ranges: Ranges, residuals_m: Floats) -
     known = np.isfinite(lifted)
     if not known.any():
         return warning(
-            WITHOUT_CURVE,
+            "no curve",
             "delays only, without any power: the effect of power is unknown and contained in delays and errors, so "
             "delays from other distances will differ",
         )
@@ -97,7 +94,7 @@ def _without_curve(found: KnownDistances, ranges: Ranges, residuals_m: Floats) -
     middle = medians(residuals_m[known], number)[np.bincount(number) >= 20]
     reach = float(np.ptp(np.percentile(middle, (5, 95)))) if len(middle) else 0.0
     return warning(
-        WITHOUT_CURVE,
+        "no curve",
         f"delays only: errors that change with power stay in the ranges, here {as_length(reach)} between "
         f"{low:.0f} and {high:.0f} dBm; delays are averages over the recorded powers, and differ by up to "
         f"{reach / SPEED_OF_LIGHT * 1e9:.2f} ns at single powers",

@@ -16,12 +16,12 @@ from scipy import special
 from calib.estimator.known_distances import KnownDistances
 from calib.estimator.score_tests import Slopes, Tested
 from calib.estimator.time_blocks import TimeBlocks
-from calib.findings import SMALLEST_NS, Finding, warning
+from calib.findings import BUDGET, FIT_LEVELS, SMALLEST_NS, Finding, warning
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 
-WIDENING_DEVIATION, CERTAIN_DEVIATION = 2.3, 3.1
-"""Deviations that at most 1 % and 0.1 % of sound flights have: the first widens intervals, the second is reported."""
+WIDENING_DEVIATION, CERTAIN_DEVIATION = (-float(special.ndtri(share)) for share in (BUDGET, FIT_LEVELS["places"]))
+"""Deviations that at most these shares of sound flights have: the first widens intervals, the second is reported."""
 
 
 INFORMATION_LEFT = 0.03

@@ -61,12 +61,6 @@ MISSING = {
 """What ranges lack that determine no dependence, by setting: values at all, and values that differ enough; and the name
 of the latter among `REMEDIES`."""
 
-PASSES_FOR_POWER = (
-    "pattern or effect of power",
-    "the pattern over direction may be an effect of power: errors of single tags that depend on power explain the "
-    "data as well",
-)
-
 
 def fit_with_covariates(
     ranges: Ranges, settings: FitSettings
@@ -130,7 +124,12 @@ def _with(
         if evidence >= LOG_EVIDENCE and marginal > likeliest:
             explained = name == "pattern" and log_evidence(_beside_power(plain, covariate, kind)) < LOG_EVIDENCE
             known = {"kind": mode, "log_evidence": round(evidence, 1)}
-            best, likeliest = (found, known, [warning(*PASSES_FOR_POWER)] * explained), marginal
+            by_power = warning(
+                "pattern or effect of power",
+                "the pattern over direction may be an effect of power: errors of single tags that depend on power "
+                "explain the data as well",
+            )
+            best, likeliest = (found, known, [by_power] * explained), marginal
         # Slopes of tags are about a common one: what speaks against that speaks against them, too.
         beside = min(evidence, 0.0) * (name == "temperature")
     if best is nothing:

@@ -21,7 +21,6 @@ from calib.calibration.error_model import lasting_errors
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import (
-    WITHOUT_CURVE,
     dependence_on_initiator,
     doubts_about_data,
     implausible_values,
@@ -189,7 +188,7 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
         ranges=some,
         # The curve is known, and was taken off before.
         findings=[
-            *[one for one in found.findings if one.fault != WITHOUT_CURVE],
+            *[one for one in found.findings if one.fault != "no curve"],
             *([unshared] if len(joined.patterns) > len(calibration.patterns) else []),
         ],
     )

@@ -86,7 +86,7 @@ def _corners(flown: FlightPlanSettings) -> Floats:
 
 
 def _in_turn(flown: FlightPlanSettings, count: int, rng: np.random.Generator) -> Ints:
-    """Return the tags (n, 2) of the ranges: all pairs on different bodies but two anchors, each round in another order."""
+    """Return the tags (n, 2) of ranges: all pairs on different bodies but two anchors, each round in another order."""
     body = {tag: k for k, robot in enumerate(flown.robots) for tag in robot}
     pairs = [
         *((a, b) for a, b in combinations(body, 2) if body[a] != body[b]),
