@@ -1,4 +1,4 @@
-"""Exchanges and poses from what a caller has, and back into columns; how they look."""
+"""Exchanges and poses from arrays, and as columns; their text form."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ DS: dict[str, Any] = SS | {"tx3": [99_005, 99_003], "rx3": [101_000, 101_009]}
 
 
 def test_ranges_without_stamps_are_those_of_a_table_without_stamps(tmp_path):
-    """An importer of one's own for a device that prints ranges needs no stamps."""
+    """A registered importer for a device that prints ranges needs no stamps."""
     (tmp_path / "t.csv").write_text("time_s,from_id,to_id,range_m,fpp2\n0.5,1,7,3.1,-82.5\n0.6,2,7,3.2,-83.0\n")
     table = read_source(tmp_path / "t.csv").exchanges
     mine = Exchanges.from_arrays(

@@ -30,7 +30,7 @@ def ended(process, number=signal.SIGINT):
     try:
         out, err = process.communicate(timeout=60)
     except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGABRT)  # it prints where it stands
+        process.send_signal(signal.SIGABRT)  # it prints in its own folder
         raise AssertionError(process.communicate()) from None
     assert "Traceback" not in err, err
     return out, err
@@ -87,7 +87,7 @@ def test_a_report_that_is_interrupted_says_so_and_leaves_no_half(flight, tmp_pat
     wait_for(lambda: is_working(process), process)
     time.sleep(1.0)
     _, err = ended(process)
-    # On a quick machine it may have been done before.
+    # On a fast machine it may have ended before.
     assert process.returncode in (130, 0)
     assert ("interrupted" in err) == (process.returncode == 130)
     assert files(tmp_path) == ([] if process.returncode else ["page.html"])
@@ -104,7 +104,7 @@ def test_an_import_that_is_interrupted_is_one_line_and_leaves_nothing(tmp_path):
     wait_for(lambda: is_working(process), process)
     time.sleep(0.2)
     _, err = ended(process)
-    # On a quick machine it may have been done before.
+    # On a fast machine it may have ended before.
     assert (process.returncode, err) in ((130, "interrupted\n"), (0, ""))
     assert files(tmp_path) == (["t.csv"] if process.returncode else ["t.csv", "t.uwb"])
 
@@ -119,7 +119,7 @@ def test_an_import_that_is_interrupted_is_one_line_and_leaves_nothing(tmp_path):
     ],
 )
 def test_a_writer_that_is_ended_leaves_nothing(long, tmp_path, words, number):
-    """Ended as soon as it has begun to write, which a poll of its folder sees."""
+    """Interrupted when the first file appears in its folder."""
     folder = long.parent / f"{tmp_path.name}"
     folder.mkdir()
     process = subprocess.Popen(
@@ -152,6 +152,6 @@ def wait_for(ready, process):
 
 
 def is_working(process):
-    """Whether a process has used a second's half of processor time, so that its start is behind it."""
+    """Return whether a process has used half a second of processor time, so that its start is over."""
     fields = Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()
     return int(fields[11]) + int(fields[12]) > os.sysconf("SC_CLK_TCK") / 2

@@ -1,4 +1,4 @@
-"""Output files: whole or not there at all."""
+"""Output files: complete or absent."""
 
 import signal
 import tempfile
@@ -54,7 +54,7 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
         write_files(tmp_path / "file" / "er", {"a": b""}, force=False)
 
 
-# Files that cannot be read as text: one line each, in the caller's error.
+# Files that cannot be read as text: one line each, as the caller's error.
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_text_comes_back_as_it_is(tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_that_another_thread_receives_as_a_file_begins_leaves_nothing(tmp_path, monkeypatch, number):
-    """Python handles it in the main thread, where it must not part the making of a folder from its removal."""
+    """Python handles it in the main thread, where it must not come between making a folder and its removal."""
 
     def leave(*_):
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""A board that is deaf for a while is asked once more; one that is dead is called so."""
+"""A board that does not react for a while is asked once more; one that does not answer at all is reported as dead."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from uwblink.wire.codec import encode
 
 
 class Deaf:
-    """A board that takes in what is written to it only from `wakes_s` on; time passes while it is read."""
+    """A board that reads its input only from `wakes_s` on; time advances while it is read."""
 
     name = "port"
 
@@ -22,7 +22,7 @@ class Deaf:
     def read(self, timeout_s):
         if self.heard and self.time_s + timeout_s >= self.wakes_s:
             self.time_s = max(self.time_s, self.wakes_s)
-            # The firmware carries out only the last of the commands that wait.
+            # The firmware executes only the last of the waiting commands.
             last, self.heard = self.heard[-1], []
             return self.answers[last]
         self.time_s += timeout_s
@@ -67,7 +67,7 @@ def test_the_answer_to_the_second_asking_may_fail_too():
         Board(Once(0.0, ANSWERS)).request(m.GetId())
 
 
-# The driver's side of a conversation, without ports: outcomes, late replies, fences, times, what may be sent.
+# The driver's side of a conversation, without ports: outcomes, late replies, fences, times, allowed commands.
 
 
 REPORT = (
@@ -121,7 +121,7 @@ def test_only_an_impulse_response_that_was_asked_for_keeps_the_board_quiet():
     with_cir = asked(m.RangeCommand(2, get_cir=True))
     with_cir.receive(REPORT, 1.0)
     assert (with_cir.ready_s(1.0), with_cir.ready_s(1.02)) == (pytest.approx(0.030), pytest.approx(0.010))
-    # Once it is there, the report of a target may follow within 3 ms.
+    # After it, the report of a target may follow within 3 ms.
     with_cir.receive(CIR, 1.028)
     assert (with_cir.ready_s(1.03), with_cir.ready_s(1.04)) == (pytest.approx(0.003), 0.0)
 

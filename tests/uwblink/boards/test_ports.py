@@ -1,4 +1,4 @@
-"""Ports: what cannot be opened says why, and a port can be a URL."""
+"""Ports: errors state why a port cannot be opened, and a port can be a URL."""
 
 import errno
 import json
@@ -62,7 +62,7 @@ def test_a_second_opening_is_refused_and_a_lost_port_says_so():
 
 @pytest.fixture
 def answerer():
-    """A board behind TCP that knows only its id."""
+    """A board behind TCP that only has an id."""
     listening = socket.create_server(("127.0.0.1", 0))
 
     def serve():
@@ -96,7 +96,7 @@ def test_bytes_from_before_the_opening_are_not_taken_for_answers():
             assert board.id == 1
 
 
-# Ranging plans: files, turns, and what is wrong with them.
+# Ranging plans: files, turns, and errors.
 
 
 def written(tmp_path, text):

@@ -1,4 +1,4 @@
-"""What the three commands share: errors as one line, statuses, warnings of plug-ins, flags for parameters."""
+"""Functions of the three commands: errors as one line, statuses, warnings of plug-ins, flags for parameters."""
 
 import io
 import os
@@ -25,7 +25,7 @@ class MineError(Exception):
 
 
 class WorseError(MineError):
-    """One with a status of its own."""
+    """An error with its own status."""
 
 
 def run_as_command(work, *errors, **how):
@@ -108,11 +108,11 @@ def test_the_library_speaks_of_parameters_and_each_has_its_flag():
         assert re.findall(r'"[^"\n]*?(?<![-\w])--[a-z][-a-z]+[^"\n]*"', text) == [], path
         named |= set(re.findall(r'"[^"\n]*`([a-z_]+)`', text))
     assert {"force", "offset", "map_file", "tags_from"} <= named
-    # Of columns of tables and keys of maps the descriptions of map keys speak.
+    # Descriptions of map keys name columns of tables and keys of maps.
     assert {shared.with_flags(f"`{name}`") for name in named - {"message", "time_s", "line"}} <= options
 
 
-# What a command does before anything is imported for it.
+# Actions of a command before its imports.
 
 
 THREADS = """
@@ -214,7 +214,7 @@ run(app, arguments=[])
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
 
 
-# The line that a command shows while it works.
+# The progress line of a command.
 
 
 class Terminal(io.StringIO):

@@ -1,4 +1,4 @@
-"""What leaves the project: every column of every table comes back, and other readers read it."""
+"""Exports: every column of every table is imported again unchanged, and other programs read the files."""
 
 import json
 from typing import Any
@@ -23,7 +23,7 @@ from uwblink.recording.schema import TABLES, Fault, Poses, Tag
 
 @pytest.fixture(scope="module")
 def whole(full):  # noqa: F811
-    """A recording with rows in every table, and without what only a stranger's hand leaves missing."""
+    """A recording with rows in every table, without missing values that only edited files have."""
     with duckdb.connect(str(full)) as db:
         db.execute("DELETE FROM exchanges WHERE tx1 IS NULL")
         db.execute("DELETE FROM cirs WHERE magnitudes IS NULL")
@@ -34,7 +34,7 @@ def whole(full):  # noqa: F811
 
 
 def in_order(path):
-    # Contents are saved in order of time, the exchanges as they are.
+    # Contents are saved in order of time, the exchanges in their own order.
     return {table: found if table == "exchanges" else sorted(found) for table, found in rows(path).items()}
 
 
@@ -50,7 +50,7 @@ def test_every_column_of_every_table_comes_back(whole, tmp_path, form):
 
 
 def test_trajectories(tmp_path):
-    """Also times of a clock that began elsewhere; the second one lies within a second of zero."""
+    """Also times of a clock with another origin; the second is within a second of zero."""
     time = [1_706_822_508_042_560_815, -1_500_000_000, -250_000_000, 750_000_000]
     poses = Poses.from_arrays(time, ["a/b", "c", "c", "c"], [[1.5, -2.0, 0.1]] * 4, [[0.0, 0.0, 0.6, 0.8]] * 4)
     with Recording.create(tmp_path / "r.uwb") as recording:
@@ -120,7 +120,7 @@ def test_a_link_to_a_recording_is_exported_like_the_recording(tmp_path):
 
 @pytest.fixture
 def flown(tmp_path):
-    """One tag on a body that flies along x, half a metre ahead of it; the second of three distances was measured."""
+    """One tag on a body that moves along x, half a metre ahead of it; the second of three distances was measured."""
     exchanges = Exchanges.from_arrays(
         [1] * 3, [2] * 3, time_ns=[0, 10**9, 10**10], tx1=[0] * 3, rx1=[0] * 3, tx2=[10**8] * 3, rx2=[127_795_200] * 3,
         truth_m=[np.nan, 7.25, np.nan],
@@ -134,7 +134,7 @@ def flown(tmp_path):
 
 
 BY_HAND = [np.hypot(0.5 + 2 * 0.001, 3.0), 7.25]
-"""By a range's middle, 1 ms after its time, the body is at 2 mm; the third exchange is after the last pose."""
+"""At the middle of a range, 1 ms after its time, the body is at 2 mm; the third exchange is after the last pose."""
 
 
 @pytest.mark.parametrize("to", ["csv", pytest.param("parquet", marks=pytest.mark.slow)])
@@ -155,7 +155,7 @@ def test_messages_have_true_distances_by_the_poses(flown, tmp_path):
     assert found.truth_m == pytest.approx([*BY_HAND, np.nan], abs=1e-9, nan_ok=True)
 
 
-# What was exported, read by the readers that others use: mcap, rosbags and pandas.
+# Exports read by common readers: mcap, rosbags and pandas.
 
 
 WHEN = 1_706_822_508_042_560_815
@@ -206,7 +206,7 @@ def test_rosbags_reads_standard_messages(recording, tmp_path):
     found = by_topic["/uwb/range_2_5"]
     expected_ns = sorted(e.time_ns[chosen].tolist())
     assert [(t, kind) for t, kind, _ in found] == [(t, "sensor_msgs/msg/Range") for t in expected_ns]
-    # The message holds floats of 32 bits.
+    # The message has floats of 32 bits.
     expected = e.range_m[chosen][np.argsort(e.time_ns[chosen])]
     assert [m.range for *_, m in found] == pytest.approx(expected.tolist(), rel=1e-6)
     stamp = found[0][2].header.stamp
@@ -285,7 +285,7 @@ def test_bags_without_the_extra_are_refused(recording, tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def corrected(tmp_path_factory):
-    """A flight of three tags, before and after a calibration, and what that says of each range."""
+    """A flight of three tags before and after a calibration, and the correction of each range."""
     folder = tmp_path_factory.mktemp("corrected")
     flight = calib.sample_flight()
     Contents(exchanges=flight.exchanges, tags=flight.tags, poses=flight.poses).save(folder / "f.uwb")
@@ -301,7 +301,7 @@ def test_corrected_ranges_leave_with_what_is_known_of_each(corrected, tmp_path, 
     frame = {"csv": pd.read_csv, "parquet": pd.read_parquet}[form](tmp_path / "out" / f"corrected.{form}")
     assert frame["time_ns"].tolist() == exchanges.time_ns.tolist()
     for name in ("raw_m", "corrected_m", "sigma_m", "sigma_total_m", "tail_share", "tail_probability", "clamped"):
-        # Pandas before 3 reads floats to 3e-14; that every digit is in the file shows when it comes in again, below.
+        # Pandas before 3 reads floats to 3e-14; the import below shows that all digits are in the file.
         assert frame[name].tolist() == pytest.approx(getattr(applied, name).tolist(), rel=1e-13, abs=0)
     assert frame["clamped"].dtype == frame["outlier"].dtype == bool
     assert frame["outlier"].tolist() == applied.outlier.tolist()

@@ -1,4 +1,4 @@
-"""Exchanges in bags of ROS 1, ROS 2 and MCAP, of messages that are defined here, by a map of their fields."""
+"""Exchanges in bags of ROS 1, ROS 2 and MCAP, with message types defined here, by a map of their fields."""
 
 import numpy as np
 import pytest

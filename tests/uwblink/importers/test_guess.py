@@ -1,4 +1,4 @@
-"""What a table is taken for, and that the map says so in words that work."""
+"""The guess of a table's meaning, and the map that states it and works."""
 
 import re
 
@@ -30,7 +30,7 @@ POLL = ("poll_tx", "poll_rx", "resp_tx", "resp_rx", "final_tx", "final_rx")
 
 
 def guessed(tmp_path, rows, *how):
-    """What comes in from a table of rows by the map that is proposed for it."""
+    """Return the result of an import of a table with the map that is proposed for it."""
     path = write(tmp_path / "t.csv", rows, *how)
     guess = guess_map(path)
     assert guess.complete
@@ -146,7 +146,7 @@ def test_places_of_which_some_are_missing_are_not_used_and_it_is_said(tmp_path):
 
 
 def test_a_table_without_time_between_the_last_messages_is_guessed_in_peace(tmp_path):
-    """Of which some ranges are infinite; as in commands, a warning of NumPy would be an error."""
+    """Some ranges are infinite; as in commands, a warning of NumPy would be an error."""
     rows = [row | ({"tx3": row["tx2"]} if k % 2 else {}) for k, row in enumerate(wrapped(flights()))]
     assert "tx3" in guess_map(write(tmp_path / "t.csv", rows, ",")).text
 
@@ -214,7 +214,7 @@ def test_words_for_ids_are_told_with_their_numbers(tmp_path):
     ],
 )
 def test_ends_that_are_called_alike(tmp_path, ends):
-    """Twelve pairs stay twelve: each end has its own column."""
+    """Twelve pairs remain twelve: each end has its own column."""
     pairs = [(one, two) for one in range(1, 5) for two in range(1, 5) if one != two]
     rows = [{"t_s": k, **dict(zip(ends, pairs[k % 12], strict=True)), "range_m": 3 + k / 7} for k in range(60)]
     guess = guess_map(write(tmp_path / "t.csv", rows))
@@ -233,7 +233,7 @@ def test_ends_that_are_called_alike(tmp_path, ends):
     ],
 )
 def test_what_a_table_does_not_tell_is_asked_for(tmp_path, row, asked, answer):
-    """The map as it was guessed imports nothing, and nor does one without the line; one with an answer does."""
+    """The guessed map imports nothing, nor does one without the line; one with an answer does."""
     rows = [{n: v + k if n in ("t", "range", "t_s") else v for n, v in row.items()} for k in range(40)]
     text = guess_map(write(tmp_path / "t.csv", rows)).text
     assert f'{asked} = "?"' in text
@@ -300,7 +300,7 @@ def test_what_is_not_there_is_said_and_nothing_is_made_up(tmp_path, rows, comple
 
 
 def test_third_stamps_of_the_initiator_in_exchanged_columns_are_not_those_of_the_target(tmp_path):
-    """They look so, by a clock whose rate follows the range, and every range would be plausible and wrong."""
+    """Exchanged columns look like a clock whose rate follows the range; every range would be plausible and wrong."""
     random = np.random.default_rng(4)
     noisy = [
         {n: v + int(random.integers(-6, 7)) if n in HEADER[3:9] else v for n, v in row.items()}
@@ -308,7 +308,7 @@ def test_third_stamps_of_the_initiator_in_exchanged_columns_are_not_those_of_the
     ]
     exchanged = [row | {"tx3": row["rx3"], "rx3": row["tx3"]} for row in noisy]
     assert "protocol" in guess_map(write(tmp_path / "exchanged.csv", exchanged)).asked
-    # Those of the target, by a clock that is 20 ppm off, and of the initiator in their columns are read as ever.
+    # Stamps of the target, with a clock that is 20 ppm off, and of the initiator in their columns are read as usual.
     skewed = [
         {n: (round(v * (1 + 20e-6)) if n in ("rx1", "tx2", "tx3") else v) for n, v in row.items()}
         for row in flights(120, third="target")
@@ -335,7 +335,7 @@ OWN = {"time_s": "time_s", "at_id": "tag", "from_id": "anchor_a", "to_id": "anch
     ],
 )
 def test_differences_of_arrival_without_stamps_are_read(tmp_path, header, named, units):
-    """Of a table with the columns of the public set UTIL, and of others; what their sign is taken for is said."""
+    """Tables with the columns of the public set UTIL, and others; the assumed sign is stated."""
     cells = {"tag": "9", "anchor_a": "1", "idA": "1", "from_id": "1", "anchor_b": "2", "idB": "2", "to_id": "2"}
     cells |= {"anchor_minus": "1", "anchor_plus": "2"}
     rows = "".join(

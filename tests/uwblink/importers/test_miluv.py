@@ -31,7 +31,7 @@ def antenna(tag):
 
 
 def exchange(random, pair, when) -> tuple[dict[str, int], dict[str, Any]]:
-    """One DS-TWR exchange between clocks of one rate, in whole unwrapped ticks, and the row that MILUV makes of it."""
+    """Return one DS-TWR exchange between clocks of equal rate, in whole unwrapped ticks, and its row in MILUV."""
     first, second = pair
     distance = float(np.linalg.norm(antenna(first) - antenna(second)))
     flight = round(distance / AIR * 1e9 / TICK_NS)
@@ -57,7 +57,7 @@ def write(path, rows):
 
 @pytest.fixture
 def flight(tmp_path):
-    """A folder with two robots and two anchors; returns it, the stamps in order of time, and the passive ones."""
+    """A folder with two robots and two anchors, its stamps in order of time, and the passive ones."""
     random, folder = np.random.default_rng(3), tmp_path / "flight"
     pairs = [(10, 0), (20, 11), (11, 1), (20, 0), (10, 20), (20, 1)]
     made = [exchange(random, pair, 1.0 + k / 8) for k, pair in enumerate(pairs)]
@@ -194,7 +194,7 @@ def test_the_real_flight_gives_the_ranges_of_its_boards(real, tmp_path):
     assert (found.counts(), found.meta["anchor_constellation"]) == (counts, "0")
     assert found.meta["doubled_rows"] == {"uwb_range.csv": 123, "uwb_passive.csv": 261, "uwb_cir.csv": 0}
     e = found.exchanges
-    # The boards cut their ranges to 0.1 mm.
+    # The boards round their ranges down to 0.1 mm.
     assert np.abs(raw_range(e) - e.range_m).max() < 2e-4
     measured = {}
     for path in real.glob("*/uwb_range.csv"):

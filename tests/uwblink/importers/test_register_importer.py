@@ -1,4 +1,4 @@
-"""A kind of file that somebody adds: from Python and from the command line, and what is refused."""
+"""A registered importer: from Python and from the command line, and errors."""
 
 from contextlib import contextmanager
 from dataclasses import replace
@@ -27,7 +27,7 @@ BLANKS = Importer("blanks", (".ranges", ".ranges.txt"), read_blanks, "Import six
 
 @contextmanager
 def registered(**changes):
-    """Register an importer like BLANKS for a while."""
+    """Register an importer like BLANKS, and remove it afterwards."""
     changed = replace(BLANKS, **changes)
     register_importer(changed)
     try:

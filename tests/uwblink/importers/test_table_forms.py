@@ -1,4 +1,4 @@
-"""Tables as people have them: their own writer here, which shares nothing with the importer, and planted values."""
+"""Variants of tables, by a separate writer that shares no code with the importer, with planted values."""
 
 import csv
 import gzip
@@ -23,11 +23,11 @@ HEADER = ["time_s", "from_id", "to_id", "tx1", "rx1", "tx2", "rx2", "tx3", "rx3"
 
 
 BOUNDS = ((200, 3000), (0, 2**41), (0, 2**41), (20_000_000, 40_000_000), (80_000_000, 90_000_000))
-"""Ticks of an exchange: flight, the beginning of each clock, reply, and from the second message to the third."""
+"""Ticks of an exchange: flight, start of each clock, reply, and from the second message to the third."""
 
 
 def flights(count=60, third="target"):
-    """Exchanges between tags 1, 2, 3 as unwrapped ticks of two clocks, and their true distances (whole ticks)."""
+    """Return exchanges between tags 1, 2, 3 as unwrapped ticks of two clocks, and true distances (whole ticks)."""
     random = np.random.default_rng(1)
     rows = []
     for k in range(count):
@@ -44,12 +44,12 @@ def flights(count=60, third="target"):
 
 
 def repeated(rows, times):
-    """The same exchanges many times, each time with all clocks further on: no two have the same stamps."""
+    """Return the same exchanges many times, with all clocks later each time, so that no stamps are equal."""
     return [later(row, k) for k in range(times) for row in rows]
 
 
 def later(row, ticks):
-    """The same exchange when both clocks are further on."""
+    """Return the same exchange with both clocks later."""
     return {n: v + ticks if n in HEADER[3:9] else v for n, v in row.items()}
 
 
@@ -85,7 +85,7 @@ def read_table(source, map_file=None):
 
 
 def read_rows(tmp_path, rows, text=None):
-    """Write rows to a table, and read it by a map with this text."""
+    """Write rows to a table, and read it with a map of this text."""
     return read_table(write(tmp_path / "t.csv", rows), None if text is None else mapped(tmp_path, text))
 
 
@@ -123,7 +123,7 @@ def test_unwrapped_stamps_in_any_unit(tmp_path, unit, scale):
     rows = flights()
     scaled = [{n: repr(v * scale) if n in HEADER[3:9] else v for n, v in row.items() if n != "truth"} for row in rows]
     found = read_rows(tmp_path, scaled, f"[units]\nstamps = {unit}\n")
-    # The first stamp of a clock is off by what a float of so many seconds holds; what follows it is not.
+    # The first stamp of a clock has the rounding error of a float of so many seconds; the following intervals do not.
     np.testing.assert_allclose(found.exchanges.range_m, [row["truth"] for row in rows], atol=1e-9)
     assert any("unwrapped" in note for note in found.meta["notes"])
 
@@ -167,9 +167,9 @@ def test_swapped_columns_are_named(tmp_path):
 def test_corrupt_rows_are_faults_with_their_place(tmp_path):
     rows = flights(count=200)
     lines = write(tmp_path / "t.csv", wrapped(rows)).read_text().splitlines()
-    lines[10] = lines[10].replace(",", ",x", 1)  # an id that is none
-    lines[20] = ",".join(lines[20].split(",")[:6])  # a short row
-    lines[30] += ",1,2,3"  # a long one
+    lines[10] = lines[10].replace(",", ",x", 1)  # not an id
+    lines[20] = ",".join(lines[20].split(",")[:6])  # a row with too few cells
+    lines[30] += ",1,2,3"  # a row with too many cells
     lines[40] = lines[40].rsplit(",", 2)[0] + ",,nan"  # powers are optional
     lines[50] = lines[50].replace(f",{rows[49]['rx2'] % 2**32},", ",-5.5,")
     lines.insert(60, "")
@@ -202,7 +202,7 @@ def test_iso_times_names_and_programmed_delays(tmp_path):
     assert found.meta["configured_antenna_delay_ticks_by_tag"] == {"77": {"tx": 64, "rx": 16486}}
     assert (found.meta["tag_names"]["77"], found.exchanges.initiator[0]) == ("AA:1", 77)
     assert {tag.body for tag in found.tags} >= {"AA:1", "AA:2", "AA:3"}
-    # 07:08:10 two hours east of Greenwich; zones are shifts of a time whose fraction DuckDB keeps to microseconds.
+    # 07:08:10 two hours east of Greenwich; DuckDB keeps microseconds, and zones are shifts.
     assert abs(int(found.exchanges.time_ns[0]) - 1714972090_000000000) < 1000
 
 

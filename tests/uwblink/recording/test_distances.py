@@ -14,7 +14,7 @@ NEGATED = tuple(-q for q in YAW_90)
 @pytest.mark.parametrize(
     ("begin", "end", "stands", "time_ns", "expected"),
     [
-        # At half time body a is at (1, 0, 0), and its arm, turned by 90 degrees, points along y.
+        # At half of the time, body a is at (1, 0, 0), and its arm, rotated by 90 degrees, points along y.
         (((0, 0, 0), YAW_90), ((2, 0, 0), YAW_90), (1, 4, 0), 50, 3.0),
         (((0, 0, 0), YAW_90), ((0, 0, 0), NEGATED), (0, 4, 0), 50, 3.0),
         (((0, 0, 0), LEVEL), ((0, 0, 0), LEVEL), (0, 4, 0), -1, np.nan),

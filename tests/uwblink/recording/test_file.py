@@ -1,4 +1,4 @@
-"""The recording: what goes in comes out, and what is not a recording says so."""
+"""The recording: data are read as written, and other files are refused."""
 
 import shutil
 import subprocess
@@ -50,7 +50,7 @@ def change(path, *statements):
 
 
 LATER = ("imu", "height", "powers", "quality", "temperature", "receptions", "differences", "corrected")
-"""Tables that files from before them do not have."""
+"""Tables that files of earlier versions lack."""
 
 
 def test_an_existing_file_is_not_replaced_without_force(recording):
@@ -91,7 +91,7 @@ def test_a_truncated_recording_is_one_clear_error(recording, tmp_path, share):
     ],
 )
 def test_wrong_tables_and_newer_versions(recording, statement, said):
-    """Tables of `LATER` may be missing, but not in part."""
+    """Tables of `LATER` may be missing, but not some of their columns."""
     change(recording, statement)
     with pytest.raises(RecordingError, match=said):
         Recording.open(recording)
@@ -136,7 +136,7 @@ def test_a_damaged_file_with_the_word_lock_in_its_path_is_damaged(recording, tmp
 
 
 @pytest.mark.parametrize(("name", "command"), [("t.csv", "csv"), ("t.csv.gz", "csv"), ("t.MCAP", "bag")])
-@pytest.mark.parametrize("size", [100, 3 * 4096 + 16384])  # odd, and that of a database
+@pytest.mark.parametrize("size", [100, 3 * 4096 + 16384])  # an odd number of bytes, and the size of a database
 def test_a_table_given_for_a_recording_is_told_how_to_become_one(tmp_path, name, command, size):
     (tmp_path / name).write_bytes(b"a" * size)
     with pytest.raises(RecordingError, match=f"{name}: is not a recording; convert it with `uwblink import {command}`"):

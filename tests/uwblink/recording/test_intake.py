@@ -1,4 +1,4 @@
-"""Files from strangers: what is a program in them is refused before it runs, what is too much before it is read."""
+"""Untrusted files: programs in them are refused before they run, and too large contents before they are read."""
 
 import json
 import shutil
@@ -41,7 +41,7 @@ ENDLESS = (
         (["DROP TABLE meta", f"CREATE VIEW meta AS {HUGE}"], "a view, meta"),
         (["DROP TABLE meta", f"CREATE VIEW meta AS {ENDLESS}"], "a view, meta"),
         (["DROP TABLE poses", "CREATE VIEW poses AS SELECT * FROM exchanges, range(1000000)"], "a view, poses"),
-        # What would stand for the database's own functions, and lie about the rest.
+        # Objects that would replace functions of the database, and give false results.
         (
             ["CREATE MACRO duckdb_views() AS TABLE SELECT 1 WHERE false", "CREATE VIEW a AS SELECT 1"],
             "a macro, duckdb_views",
@@ -72,7 +72,7 @@ ENDLESS = (
     ],
 )
 def test_programs_in_a_file_are_refused_in_one_line(file, statements, named):
-    """Opened for reading, and those of two statements to be updated."""
+    """Files are opened for reading, and those with two statements for updating."""
     change(file, *statements)
     with pytest.raises(RecordingError, match=one_line("stranger.uwb", named)):
         Recording.open(file, update=len(statements) == 2)

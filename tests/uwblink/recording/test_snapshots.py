@@ -1,4 +1,4 @@
-"""A recording can be read by others while it is written: they get everything until now, and leave nothing behind."""
+"""A recording is read by other processes while it is written: they get all committed rows, and leave no files."""
 
 import json
 import os
@@ -27,7 +27,7 @@ with uwblink.Recording.create(sys.argv[1], live=True) as recording:
 
 
 class Reader(uwblink.Listener):
-    """Reads the recording in another process when so many exchanges have been told of, until it has `found` them."""
+    """Reads the recording in another process after some number of exchanges, until it has `found` them."""
 
     def __init__(self, path, at):
         self.path, self.at, self.turns, self.found = path, at, 0, 0
@@ -35,7 +35,7 @@ class Reader(uwblink.Listener):
     def on_turn(self, turn):
         self.turns += turn.report is not None
         if self.turns == self.at:
-            until_s = time.monotonic() + 60.0  # the writer commits every 0.1 s, and on a busy machine later
+            until_s = time.monotonic() + 60.0  # the writer commits every 0.1 s, and later under load
             while self.found != self.at and time.monotonic() < until_s:
                 shown = processes.fork("uwblink", "show", "--json", self.path).stdout
                 self.found = json.loads(shown)["counts"]["exchanges"]

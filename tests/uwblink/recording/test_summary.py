@@ -1,4 +1,4 @@
-"""What `uwblink show` says of a recording."""
+"""The summary of a recording by `uwblink show`."""
 
 import io
 from dataclasses import replace
@@ -83,7 +83,7 @@ SKEW_PPM = {1: 0.0, 2: 6.0, 3: -2.5}
 
 
 def exchanges(protocol, sign=1.0, carriers=True, warmer_ppm=0.0):
-    """Ranges of 3 m both ways in every pair; a stamp is its true time by its own clock."""
+    """Return ranges of 3 m in both directions in every pair; a stamp is its true time by its own clock."""
     pairs = np.array([(1, 2), (2, 1), (1, 3), (3, 1), (2, 3), (3, 2)] * 20)
     first, second = pairs.T
     begin = 1e-3 * np.arange(len(pairs))
@@ -137,12 +137,12 @@ def test_single_sided_exchanges_have_none():
     assert clock_skews(Exchanges.from_arrays(e.initiator, e.target, **columns)) == []
 
 
-# One exchange is one exchange, whoever reported it.
+# An exchange is counted once, whoever reported it.
 
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory):
-    """The same 2.5 seconds of three boards, targets reporting too, and not."""
+    """The same 2.5 seconds of three boards, with and without reports of targets."""
     folder = tmp_path_factory.mktemp("reports")
     for name, target_reports in (("both", True), ("one", False)):
         plan = uwblink.RangingPlan(rate_hz=60.0, target_reports=target_reports)
@@ -238,7 +238,7 @@ def as_target(report, **changes):
 def test_a_recorder_compares_the_two_reports_as_they_come():
     check = ReportCheck()
     told = "boards 1 and 2 report one exchange of 1 with 2 differently: range_m 3.0 and 3.5, rx3 600 and 601"
-    # The report of one that was lost is not compared with that of the next.
+    # The report of a lost exchange is not compared with that of the next one.
     later = RangeReport(2, 3.1, 107, 207, 307, 407, 507, 607, -80.0, -81.0, 1.0, -1.0)
     for board, report, expected in (
         (1, REPORT, None),

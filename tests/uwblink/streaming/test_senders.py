@@ -1,4 +1,4 @@
-"""What arrives at the other end: datagrams at a plain socket, messages at a viewer's WebSocket."""
+"""Received data: datagrams at a plain socket, messages at the WebSocket of a viewer."""
 
 import contextlib
 import json
@@ -154,7 +154,7 @@ def test_a_port_without_a_host_is_of_this_computer_alone(address):
             addresses = [line.split()[1].split(":") for line in LISTENING.read_text().splitlines()[1:]]
             mine = [place for place, number in addresses if int(number, 16) == port]
             assert mine == ["0100007F"], "at 127.0.0.1, and nowhere else"
-        # Another address of this computer, which a server at every address would answer.
+        # Another address of this computer, at which a server for all addresses would answer.
         with socket.socket() as other:
             other.settimeout(5)
             assert other.connect_ex(("127.0.0.2", port))
@@ -169,7 +169,7 @@ def test_a_port_that_is_taken_and_a_missing_extra_are_said(monkeypatch):
 
 
 def test_a_range_is_at_somebody_else_s_20_ms_after_its_poll(ear):
-    """By the boards' own time, so that no other work of this machine counts; docs/boards.md has the figures."""
+    """By the time of the boards, so that other load has no effect; docs/boards.md has the figures."""
     ports, late_ms = VirtualPorts(bench_scenario()), []
     with UdpSender(str(ear.getsockname()[1])) as sender:
         for found in uwblink.stream(list(ports.names.values()), duration_s=1.0, using=ports):

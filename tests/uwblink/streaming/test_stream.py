@@ -1,4 +1,4 @@
-"""Streams: what comes out of boards and recordings, in virtual time and in this one."""
+"""Streams from boards and recordings, in virtual time and in real time."""
 
 import doctest
 import json
@@ -36,7 +36,7 @@ def from_boards(ports=None, rate_hz=50.0, pairs="all", **more):
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
-    """A recording of the boards, which nobody changes."""
+    """A recording of the boards, which no test changes."""
     path = tmp_path_factory.mktemp("flown") / "f.uwb"
     flight(path)
     return path
@@ -59,7 +59,7 @@ def calibration(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def of_two(tmp_path_factory):
-    """A calibration that does not know board 3."""
+    """A calibration without board 3."""
     return calibrated(tmp_path_factory.mktemp("stream") / "two.json", (1, 2))
 
 
@@ -84,7 +84,7 @@ def test_ranges_come_one_at_a_time_and_closing_closes_the_ports():
 
 @pytest.mark.parametrize("protocol", [pytest.param("ss", marks=pytest.mark.slow), "ds"])
 def test_ranges_are_corrected_live_and_played_as_apply_corrects_them(tmp_path, calibration, protocol):
-    """The stamps say more than the range that a board prints, which in SS-TWR is a whole number of ticks."""
+    """Stamps have more digits than the range that a board prints, which in SS-TWR is a whole number of ticks."""
     live: list[uwblink.StreamedRange] = []
     printed = flight(tmp_path / "f.uwb", protocol, listeners=[RangeListener(live.append, calibration)]).range_m
     calib.apply(tmp_path / "f.uwb", calib.load_calibration(calibration), tmp_path / "corrected.uwb")
@@ -140,7 +140,7 @@ def test_what_a_correction_raises_while_boards_range_is_told_and_what_came_befor
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock that goes on only while somebody sleeps; gives the seconds slept, one number a sleep."""
+    """A clock that advances only during sleeps; yields the durations of the sleeps."""
     slept: list[float] = []
     monkeypatch.setattr(time, "monotonic", lambda: 1000.0 + math.fsum(slept))
     monkeypatch.setattr(time, "sleep", slept.append)
@@ -226,14 +226,14 @@ def test_boards_are_streamed_and_recorded_by_the_command_until_the_time_is_over(
         words = ("--rate", "50", "--duration", "1", "-o", tmp_path / "f.uwb")
         done = processes.succeed("uwblink", "stream", *server.names.values(), *words)
     rows = [json.loads(line) for line in done.stdout.splitlines()]
-    # How many there are in a second, boards in virtual time say; here it is a matter of the machine.
+    # The number per second is tested in virtual time; here it depends on the machine.
     assert len(rows) >= 3
     assert {(row["initiator"], row["target"]) for row in rows} == {(1, 2), (1, 3), (2, 3)}
     assert f"{len(rows)} ranges" in done.stderr
     loaded = uwblink.load(tmp_path / "f.uwb")
     recorded = dict(zip(loaded.exchanges.time_ns.tolist(), loaded.exchanges.range_m.tolist(), strict=True))
     streamed = {row["time_ns"]: row["range_m"] for row in rows}
-    # On a machine that is held up, a report that comes after its turn has timed out is in the file alone, with a fault.
+    # Under load, a report that comes after its turn has timed out is only in the file, with a fault.
     too_late = recorded.keys() - streamed.keys()
     assert len(too_late) <= sum(fault.kind == "time-out" for fault in loaded.faults)
     assert streamed == {time_ns: range_m for time_ns, range_m in recorded.items() if time_ns not in too_late}
@@ -266,7 +266,7 @@ def overheard(tmp_path_factory):
 
 
 def difference_of(contents, row, delays_ns):
-    """What a listener knows, corrected for delays alone: the page of numbers of `calib.data.arrivals`."""
+    """Return the difference of a listener, corrected for delays only: the formula in `calib.data.arrivals`."""
     x, h = contents.exchanges, {name: column[row].item() for name, column in contents.overheard.items()}
     (at,) = np.flatnonzero((x.rx1 == h["rx1_n"]) & (x.tx2 == h["tx2_n"]) & (x.initiator == h["initiator"]))
     e = {name: int(getattr(x, name)[at]) for name in ("initiator", "target", "time_ns", *STAMPS)}
@@ -299,11 +299,11 @@ def test_what_boards_overhear_is_streamed_with_the_ranges(overheard, tmp_path):
     for row in range(0, len(others), 9):
         whose, raw, corrected = difference_of(contents, row, delays_ns)
         assert (others[whose].difference_m, others[whose].corrected_m) == pytest.approx((raw, corrected), abs=1e-6)
-        # Five times the variance of a range where the clocks' rate is known without error, more with one from stamps.
+        # Five times the variance of a range if the clock rate has no error, more with a rate from stamps.
         assert others[whose].shared_m == pytest.approx(0.05, rel=1e-6)
         assert others[whose].sigma_m == pytest.approx(5**0.5 * 0.05, rel=0.02)
     assert [one.time_ns for one in found] == sorted(one.time_ns for one in found)
-    # Boards that are streamed give the same as their recording.
+    # Streamed boards give the same as their recording.
     live = list(from_boards(calibration=path, use="receptions", duration_s=2.0))
     assert sorted(map(str, live)) == sorted(map(str, found))
 

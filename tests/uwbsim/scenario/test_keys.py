@@ -1,4 +1,4 @@
-"""Keys of files of scenarios, faults and sweeps: limits, overrides, descriptions, and the schema that is printed."""
+"""Keys of scenarios, faults and sweeps: limits, overrides, descriptions, and the printed schema."""
 
 import json
 import re
@@ -91,7 +91,7 @@ def test_the_reference_says_unit_default_and_range():
     assert [unit_of(key) for key in ("skew_ppm_per_sqrt_s", "duration_s", "antenna")] == ["ppm/√s", "s", ""]
 
 
-# Scenarios of the world: what cannot be is one clear line, and what is named is read.
+# Errors in scenarios are one line; the files that they name are read.
 
 
 OFFICE = ROOT / "scenarios" / "nlos_office" / "office.toml"
@@ -207,7 +207,7 @@ def test_common_random_numbers():
     base = ["run.duration_s=10", "radio.rx_noise_ps=100", "radio.power_noise_db=0.5", "radio.skew_noise_ppm=0.2"]
     one = uwbsim.simulate(uwbsim.load(NOISELESS, base))
     other = uwbsim.simulate(uwbsim.load(NOISELESS, [*base, "tags.0.skew_ppm=5.5", "tags.0.delay_ns=0.9"]))
-    # Another clock moves when exchanges happen by microseconds, and nothing else of what chance decides.
+    # Another clock shifts exchanges by microseconds, and changes no other random value.
     np.testing.assert_array_equal(one.poses.position_m, other.poses.position_m)
     np.testing.assert_allclose(one.exchanges.fpp1_dbm, other.exchanges.fpp1_dbm, atol=1e-2)
     without = (one.exchanges.initiator != 1) & (one.exchanges.target != 1)
@@ -257,7 +257,7 @@ def test_listed_success_counts_failures(tmp_path):
         assert sum(p["exchanges"] for p in shown["pairs"]) == recording.count("exchanges")
 
 
-# Scenarios that come along, by name: found, listed, copied.
+# Scenarios of the package by name: found, listed, copied.
 
 
 def test_every_one_is_told_of():

@@ -1,4 +1,4 @@
-"""Sweeps: the same results whoever does the work, whatever dies on the way, and nothing twice."""
+"""Sweeps: equal results with any workers, also after faults, and no run twice."""
 
 import csv
 import importlib
@@ -99,7 +99,7 @@ def test_a_process_that_dies_is_replaced_and_several_give_the_same_bytes(alone, 
 
     class Fragile(Processes):
         def submit(self, chunk):
-            # One of the first pool dies, and one of the pool that replaces it: how many chunks there are varies.
+            # A process of the first pool ends, and one of the pool that replaces it: the number of chunks varies.
             super().submit(chunk)
             if self._pool not in pools and len(pools) < 2:
                 pools.append(self._pool)
@@ -121,7 +121,7 @@ def test_a_chunk_that_a_broken_pool_never_reports_is_done_again(alone, tmp_path,
         def submit(self, chunk):
             super().submit(chunk)
             if self.silent is None:
-                # As in the race: the pool knows nothing of the chunk, and breaks.
+                # As in the race condition: the pool does not know the chunk, and breaks.
                 (last,) = self._running
                 self.silent = Future()
                 self._running = {self.silent: self._running[last]}
@@ -189,7 +189,7 @@ def delay_weights(spans):
 
 @pytest.fixture
 def stranger(tmp_path, monkeypatch):
-    """A module of somebody else, which other processes of this machine find on the same path."""
+    """A module of a user, which other processes of this computer find on the same path."""
     folder = tmp_path / "elsewhere"
     folder.mkdir()
     (folder / "stranger.py").write_text(STRANGER)
