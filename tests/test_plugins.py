@@ -1,4 +1,4 @@
-"""Rows of other distributions: installed by pip into a folder of their own, and used through the commands."""
+"""Rows of other distributions: installed by pip into a separate folder, and used through the commands."""
 
 import json
 import os
@@ -17,7 +17,7 @@ from tests.errors import one_line
 from uwblink.errors import ArgumentError, PluginWarning
 from uwblink.plugins import Registry
 
-# The example of CONTRIBUTING.md, and two rows that cannot be used.
+# The example of CONTRIBUTING.md, and two rows with errors.
 PROJECT, MODULE = (
     next(b.code for b in pages.blocks(pages.ROOT / "CONTRIBUTING.md") if b.language == language and word in b.code)
     for language, word in (("toml", "uwbcal.protocols"), ("python", "PROTOCOL = "))
@@ -29,7 +29,7 @@ MODULE += 'BAD = RobustLoss("bad", lambda u: (u, u))\n'
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
-    """The environment of a process that has the distribution."""
+    """Return the environment of a process with the distribution."""
     source, site = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("site")
     (source / "strange_ranging").mkdir()
     (source / "pyproject.toml").write_text(PROJECT)
@@ -42,7 +42,7 @@ def installed(tmp_path_factory):
 
 @pytest.fixture
 def run(installed):
-    """Runs a command in a process that finds the distribution."""
+    """Return a function that runs a command in a process with the distribution."""
     return partial(processes.run, env=installed, timeout=300)
 
 
@@ -133,7 +133,7 @@ def check(row):
 
 @pytest.fixture
 def table(monkeypatch):
-    """A table with one row of its own, and entry points that name rows, a list of them, and mistakes."""
+    """A table with one built-in row, and entry points that name rows, a list of them, and errors."""
     entries = [EntryPoint(f"e{k}", f"tests.test_plugins:{name}", "g") for k, name in enumerate(ENTRIES)]
     asked = []
 
@@ -172,7 +172,7 @@ def test_entry_points_are_loaded_once_and_only_when_they_are_needed(table):
         assert ("nothing" in registry, len(registry), asked) == (False, 4, ["g"])
 
 
-def test_a_name_that_is_not_among_the_known_is_looked_for(table):
+def test_unknown_names_are_looked_up_in_plug_ins(table):
     registry, asked = table
     with pytest.warns(PluginWarning):
         assert registry["three"] is MANY[1]

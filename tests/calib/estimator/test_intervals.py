@@ -21,7 +21,7 @@ def fitted(recipe, seed=12_003, **settings):
     return fit_known_distances(make(recipe, seed).ranges, calib.FitSettings(**settings))
 
 
-def test_what_a_fit_uses_of_the_data_is_given_back():
+def test_variances_account_for_fitted_unknowns():
     model = model_of(make(CLEAN["short, 30 s"], 12_004).ranges[:400], calib.FitSettings(delays_only=True))
     found = robust_fit(model, model.ranges.raw_m - model.ranges.truth_m, "l2", None, ("delay",))
     delays = found.optimum.layout.indices(["delay"])

@@ -62,7 +62,7 @@ def test_planted_slopes_are_found(seed):
     assert found["response_db"].log_odds == pytest.approx(EXCESS, abs=0.06)
 
 
-def test_of_what_tells_nothing_the_slopes_are_small():
+def test_features_without_information_have_small_slopes():
     found = fitted(73, rise=0.0, excess=0.0).errors
     assert abs(found.features["rise_taps"].log_odds) < 0.15
     assert abs(found.features["response_db"].log_odds) < 0.06
@@ -86,7 +86,7 @@ def test_a_range_without_features_has_the_mean_share():
     assert fitted(71).apply(without_features(ranges)).tail_share.mean() == pytest.approx(reflected.mean(), abs=0.03)
 
 
-def test_beyond_the_fitted_values_odds_stay_constant():
+def test_odds_are_constant_beyond_the_fitted_values():
     known = fitted(71)
     top = known.errors.features["rise_taps"].bounds[1]
     shares = [

@@ -126,7 +126,7 @@ def test_single_sided_ranges_and_missing_ones_are_warned_of():
     assert any("25 % of the exchanges were left out: no true distance" in warning for warning in found.warnings)
 
 
-def test_a_likelihood_that_leaves_a_pair_out_is_not_believed(monkeypatch):
+def test_a_search_that_excludes_a_pair_is_rejected(monkeypatch):
     found_by, r = known_distances.fit_likelihood, ranges(2000)
     assert fit(r).calibration.loss == "mixture"
 

@@ -164,7 +164,7 @@ def test_an_added_tag_shares_the_slope_of_the_others():
         ({"drift": {"sessions": 2, "days": "x", "m2_per_day": [0, 1, 2], "told": 1, "by_age": 1}}, "provenance: drift"),
     ],
 )
-def test_what_a_stranger_wrote_into_the_provenance_is_refused_in_a_line(tmp_path, broken, why):
+def test_faulty_provenance_is_refused_in_a_line(tmp_path, broken, why):
     table = json.loads(fitted(WARM, 3).to_json())
     (tmp_path / "c.json").write_text(json.dumps(table | {"provenance": table["provenance"] | broken}))
     refuse("calib", "show", tmp_path / "c.json", naming=[why])
@@ -280,7 +280,7 @@ def test_readings_that_are_of_no_range_are_named(tag, later_s):
 
 
 @pytest.mark.parametrize(("celsius", "doubted"), [(46.0, False), (72.0, True)])
-def test_degrees_fahrenheit_are_doubted(celsius, doubted):
+def test_degrees_fahrenheit_have_a_warning(celsius, doubted):
     flight = calib.sample_flight()
     count = len(flight.exchanges)
     readings = {"time_ns": flight.exchanges.time_ns, "tag": np.full(count, 1), "supply_v": np.full(count, np.nan)}

@@ -59,7 +59,7 @@ def test_the_campaign_has_every_section_in_order(campaign):
         assert page.count(hashlib.sha256((campaign / name).read_bytes()).hexdigest()) == 1
 
 
-def test_every_figure_has_the_size_of_paper(campaign):
+def test_all_figures_have_paper_size(campaign):
     page = (campaign / "r.html").read_text()
     drawings = re.findall("<svg.*?</svg>", page, re.DOTALL)
     assert len(drawings) == 2 * page.count("<figure>")
@@ -123,7 +123,7 @@ def test_the_json_tells_what_the_page_tells(campaign):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 390])
-def test_a_browser_shows_it(campaign, tmp_path, width):
+def test_a_browser_shows_the_report(campaign, tmp_path, width):
     picture = tmp_path / "page.png"
     words = (f"--window-size={width},2400", f"--screenshot={picture}", (campaign / "r.html").as_uri())
     chromium(*words, profile=tmp_path / "profile")

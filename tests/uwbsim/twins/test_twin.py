@@ -64,7 +64,7 @@ def test_rates_and_noises_are_found(found):
         ("mean_delay_ns", pytest.approx(0.0, abs=0.01)),
         ("direct_std_m", pytest.approx(0.0, abs=0.01)),
         ("path_loss_exponent", pytest.approx(2.4, abs=0.1)),
-        # Which ranges are reflected is not known for certain, and what is not known looks like fading.
+        # Which ranges are reflected is uncertain, and this uncertainty has the effect of fading.
         ("fading_db", pytest.approx(0.0, abs=0.4)),
     ],
 )

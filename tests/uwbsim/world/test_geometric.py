@@ -260,7 +260,7 @@ def test_weak_first_paths_have_noisier_stamps():
         ({"room": ROOM | {"floor": "cheese"}}, "room.floor.*cheese.*known are air"),
     ],
 )
-def test_what_cannot_be_is_refused(more, fragment):
+def test_wrong_rooms_and_materials_are_refused(more, fragment):
     with pytest.raises(uwbsim.ScenarioError, match=fragment):
         scenario(**more)
 
