@@ -90,7 +90,7 @@ def test_rows_are_chosen_by_number_slice_and_mask():
 
 
 @pytest.mark.parametrize("count", [0, 1, 6, 7, 10_000])
-def test_what_is_printed_fits_on_a_screen(count):
+def test_printed_tables_fit_on_a_screen(count):
     stamps: Any = {name: np.arange(count) + 2**31 for name in SS}
     x = Exchanges.from_arrays(1, 2, **stamps, time_ns=2**60)
     poses = Poses.from_arrays(np.arange(count) + 2**60, "\x1b[31m" + "long" * 30, (1 / 3, -2 / 3, 1e-9))

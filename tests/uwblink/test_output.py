@@ -67,7 +67,7 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
         ("n" * 300, "(File name too long)"),
     ],
 )
-def test_what_cannot_be_read_is_one_line(tmp_path, name, line):
+def test_unreadable_text_files_are_one_line(tmp_path, name, line):
     (tmp_path / "folder").mkdir()
     (tmp_path / "latin1").write_bytes("abcé".encode("latin-1"))
     with pytest.raises(ImportTableError, match=one_line(line)) as found:

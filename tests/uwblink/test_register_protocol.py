@@ -89,7 +89,7 @@ def test_exchanges_of_an_unknown_protocol_are_refused_by_name():
             function(unknown)
 
 
-def test_names_are_taken_once(registered):
+def test_names_of_protocols_are_unique(registered):
     with pytest.raises(ArgumentError, match=r"already registered; choose another name, or use replace=True"):
         register_protocol(registered)
     register_protocol(replace(registered, title="better"), replace=True)
@@ -145,13 +145,13 @@ def backwards(t):
         ({"delay_weights": backwards}, "delay_weights leave 936 ticks .* antenna delays of 64 and 0"),
     ],
 )  # fmt: skip
-def test_what_cannot_work_is_refused_in_one_line(change, expected):
+def test_wrong_protocols_are_refused_in_one_line(change, expected):
     with pytest.raises(ArgumentError, match=rf"\A.*({expected}).*\Z"):
         register_protocol(replace(SYMMETRIC, **change))
     assert SYMMETRIC.name not in PROTOCOLS
 
 
-def test_what_is_no_protocol_is_refused():
+def test_other_objects_than_protocols_are_refused():
     with pytest.raises(ArgumentError, match="found 'ds', expected a RangingProtocol"):
         register_protocol("ds")  # type: ignore[arg-type]
 

@@ -41,7 +41,7 @@ def test_a_scenario_is_a_file_a_text_tables_or_itself():
         (NOISELESS, {"run.seed.x": 1}, r"^run\.seed\.x: seed is not a table"),
     ],
 )
-def test_mistakes_say_where(source, overrides, message):
+def test_errors_in_scenarios_name_the_place(source, overrides, message):
     with pytest.raises(uwbsim.ScenarioError, match=message):
         uwbsim.simulate(uwbsim.load(source, overrides))
 
@@ -56,7 +56,7 @@ def test_a_notebook_shows_the_tags_of_a_scenario():
     assert ("&lt;b&gt;" in page, page.count("data:image/png")) == (True, 1)
 
 
-def test_what_a_flight_prints_and_saves_is_true(tmp_path):
+def test_printed_and_saved_flights_agree(tmp_path):
     flight = uwbsim.simulate(uwbsim.load(NOISELESS, SHORT))
     lines = str(flight).splitlines()
     assert (2 <= len(lines) <= 6, max(map(len, lines)) <= 100) == (True, True)

@@ -70,7 +70,7 @@ def by_log(tmp_path, text, map_text):
 
 
 @pytest.mark.parametrize("name", FORMS)
-def test_what_a_board_prints_is_recorded(tmp_path, name):
+def test_printed_ranges_are_recorded(tmp_path, name):
     text, devices = FORMS[name]
     start = DIALECTS[name].start
     with printing(text, asked=start, banner="\r\n DWM1001 TWR Real Time Location System\r\n\r\ndwm> \r\n") as port:
@@ -109,7 +109,7 @@ def test_a_map_of_lines_serves_as_for_logs_and_a_stream_is_corrected(tmp_path):
     assert [row["corrected_m"] for row in rows] == pytest.approx([1.25] * len(rows), abs=1e-6)
 
 
-def test_a_map_means_for_boards_what_it_means_for_their_log(tmp_path):
+def test_maps_have_the_same_effect_for_boards_and_logs(tmp_path):
     """Units of a position, a constant initiator, ids of words, values without a range, and the sign of powers."""
     keys = 'line = "{to_id} {range_mm} {rxp2}"\nmissing = [65535]\n[units]\npower = "-dBm"\n[constants]\nfrom_id = 9\n'
     lines = "left 1500 80.5\nright 2500 81.5\nright 65535 99.0\n"
@@ -177,7 +177,7 @@ def test_a_board_that_is_unplugged_keeps_what_was_recorded(tmp_path):
     assert {tag.tag: tag.body for tag in found.tags} == {1: "tag1", 5: "tag5"}
 
 
-def test_a_dialect_of_ones_own_comes_by_an_entry_point_and_words_get_numbers_of_their_own():
+def test_dialects_come_by_entry_points_and_words_get_ids():
     def parse(lines):
         cells = (line.partition("=") for line in lines)
         return [PrintedRange(to_id=who, range_m=float(far)) for who, _, far in cells if far]

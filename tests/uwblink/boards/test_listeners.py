@@ -28,7 +28,7 @@ def recorded(path, *listeners, ports=None, seconds=2.0):
     return record_bench(path, None, ports, duration_s=seconds, listeners=listeners)
 
 
-def test_a_function_hears_every_message_that_the_file_gets(tmp_path):
+def test_listeners_get_every_message_in_the_file(tmp_path):
     heard: list[uwblink.Heard] = []
     done = recorded(tmp_path / "f.uwb", heard.append)
     reports = [h for h in heard if isinstance(h.message, RangeReport)]
@@ -53,7 +53,7 @@ class Everything(uwblink.Listener):
         self.faults.append(fault)
 
 
-def test_a_listener_is_told_bytes_turns_and_faults(tmp_path):
+def test_listeners_get_bytes_turns_and_faults(tmp_path):
     ports, listener = VirtualPorts(bench_scenario(), lost_share=0.4), Everything()
     done = recorded(tmp_path / "f.uwb", listener, ports=ports, seconds=2.0)
     good = sum(turn.report is not None for turn in listener.turns)
@@ -95,7 +95,7 @@ def test_a_recorder_needs_no_file(tmp_path):
         ([], float("nan"), uwblink.UwblinkError, "duration_s"),
     ],
 )
-def test_listeners_and_durations_that_are_none_are_refused(tmp_path, listeners, seconds, error, said):
+def test_wrong_listeners_and_durations_are_refused(tmp_path, listeners, seconds, error, said):
     with pytest.raises(error, match=said):
         recorded(tmp_path / "f.uwb", *listeners, seconds=seconds)
     assert list(tmp_path.iterdir()) == []
@@ -185,7 +185,7 @@ def test_a_log_stays_short_and_everything_is_in_the_file(live, monkeypatch):
 
 
 @pytest.mark.parametrize("error", [MemoryError("no more"), RuntimeError("a bug"), RecordingError("disk full")])
-def test_whatever_ends_the_writing_is_told_within_a_second(live, monkeypatch, error):
+def test_failures_of_writing_are_reported_within_a_second(live, monkeypatch, error):
     writer = RecordingWriter(live)
 
     def failing(_recording, _table, _rows):

@@ -100,7 +100,7 @@ def test_the_picture_is_the_last_minute(tmp_path):
     assert "corrected" not in text, "there is no calibration"
 
 
-def test_success_is_that_of_ten_seconds_spread_is_noise_and_gaps_are_gaps(tmp_path):
+def test_the_page_shows_success_of_ten_seconds_noise_and_gaps(tmp_path):
     """20 s of ranges of a moving tag with planted noise, and a gap of 5 s; in the last 10 s every second turn fails."""
     began_ns, noise = 1_790_000_000_000_000_000, np.random.default_rng(7).normal(0, 0.05, 200)
     progress = Progress(start_ns=began_ns, time_s=25.0)
@@ -135,7 +135,7 @@ def test_an_unplugged_board_stays_named_until_it_is_back(tmp_path):
     assert "unplugged since" not in back
 
 
-def test_what_boards_say_cannot_become_part_of_the_page(tmp_path):
+def test_output_of_boards_is_escaped_in_the_page(tmp_path):
     progress = Progress()
     progress.on_fault(Fault(0, "1", "text", "<script>alert(1)</script>"))
     with LivePage(tmp_path / "<f>.uwb") as page:
@@ -146,7 +146,7 @@ def test_what_boards_say_cannot_become_part_of_the_page(tmp_path):
         assert words in text
 
 
-def test_the_page_is_for_this_computer_alone(tmp_path):
+def test_the_page_is_served_to_this_computer_only(tmp_path):
     with LivePage(tmp_path / "f.uwb") as page:
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", page.url)
         headers, text = fetch(page)
@@ -178,7 +178,7 @@ def connected(page):
     return socket.create_connection(("127.0.0.1", port_of(page)), timeout=20)
 
 
-def test_connections_that_are_reset_or_hold_garbage_print_nothing_and_end_nothing(tmp_path, capfd):
+def test_faulty_connections_have_no_effect(tmp_path, capfd):
     requests = (
         b"",
         b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n",
@@ -199,14 +199,14 @@ def test_connections_that_are_reset_or_hold_garbage_print_nothing_and_end_nothin
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_connection_that_says_nothing_is_closed(tmp_path, monkeypatch):
+def test_silent_connections_are_closed(tmp_path, monkeypatch):
     monkeypatch.setattr(live_page._Handler, "timeout", 0.05)
     with LivePage(tmp_path / "f.uwb") as page, connected(page) as client:
         client.sendall(b"GET / HT")
         assert client.recv(100) == b"", "the other end hung up"
 
 
-def test_what_a_page_fetches_names_the_recording_of_whoever_serves_it_now(tmp_path):
+def test_pages_of_an_earlier_recorder_are_detected(tmp_path):
     """The next recorder may have the same port while the page of the previous one is still open."""
     with LivePage(tmp_path / "old.uwb") as page:
         _, whole = fetch(page)
@@ -249,7 +249,7 @@ def test_a_calibration_s_correction_is_found_by_its_entry_point(tmp_path):
     assert correct(flight.exchanges)["corrected_m"].tolist() == expected.tolist()
 
 
-def test_the_command_says_where_the_page_is_and_serves_it_while_it_records(tmp_path):
+def test_the_command_prints_the_address_of_the_page_and_serves_it(tmp_path):
     with served() as server:
         ports = [str(name) for name in server.names.values()]
         words = [str(BIN / "uwblink"), "record", *ports, "-o", str(tmp_path / "f.uwb"), "--pairs", "all", "--live"]

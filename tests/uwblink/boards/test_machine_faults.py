@@ -48,7 +48,7 @@ def exchanges_of(path):
     return found.exchanges, [fault.kind for fault in found.faults]
 
 
-def test_an_hour_forward_and_back_on_the_wall_changes_no_time_in_the_file(tmp_path, monkeypatch):
+def test_setting_the_host_clock_changes_no_times(tmp_path, monkeypatch):
     path, set_by, plain = tmp_path / "f.uwb", [0], time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: plain() + set_by[0])
     monkeypatch.setattr(time, "time", lambda: time.time_ns() * 1e-9)
@@ -63,7 +63,7 @@ def test_an_hour_forward_and_back_on_the_wall_changes_no_time_in_the_file(tmp_pa
     assert before - 10**9 < time_ns.min() < time_ns.max() < plain() + 10**9
 
 
-def test_host_time_goes_on_while_the_computer_is_suspended(monkeypatch):
+def test_host_time_continues_during_suspension(monkeypatch):
     boot = getattr(time, "CLOCK_BOOTTIME", None)
     if boot is None:
         pytest.skip("this system has no clock that counts suspension")
@@ -87,7 +87,7 @@ class Suspended(VirtualPorts):
         return ready
 
 
-def test_five_seconds_of_suspension_are_a_gap_and_nothing_else(tmp_path):
+def test_suspension_is_only_a_gap(tmp_path):
     done = record_bench(tmp_path / "f.uwb", None, Suspended(bench_scenario()), duration_s=8.0)
     exchanges, kinds = exchanges_of(tmp_path / "f.uwb")
     gaps = np.diff(np.sort(exchanges.time_ns)) * 1e-9
@@ -105,7 +105,7 @@ def live(tmp_path):
         yield recording
 
 
-def test_a_recorder_that_was_stopped_does_not_blame_the_disk(live, monkeypatch):
+def test_a_stopped_recorder_does_not_report_a_slow_disk(live, monkeypatch):
     plain, later = time.monotonic, [0.0]
     with RecordingWriter(live) as writer:
         writer.check()
@@ -116,7 +116,7 @@ def test_a_recorder_that_was_stopped_does_not_blame_the_disk(live, monkeypatch):
     assert len(live.frames()) == 1
 
 
-def test_a_disk_that_is_late_is_still_told(live, monkeypatch):
+def test_a_slow_disk_is_reported(live, monkeypatch):
     plain, later = time.monotonic, [0.0]
     with RecordingWriter(live) as writer:
         monkeypatch.setattr(time, "monotonic", lambda: plain() + later[0])
@@ -130,7 +130,7 @@ def test_a_disk_that_is_late_is_still_told(live, monkeypatch):
 
 
 @pytest.mark.parametrize("replaced", [False, True])
-def test_a_file_that_is_removed_under_the_recorder_is_told_within_a_second(tmp_path, replaced):
+def test_a_removed_file_is_reported_within_a_second(tmp_path, replaced):
     path = tmp_path / "f.uwb"
     begun = []
 
@@ -150,7 +150,7 @@ NOBODY = 65534
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give its rights away, and take a folder's from another")
-def test_a_folder_made_read_only_under_the_recorder_takes_nothing_away():
+def test_a_read_only_folder_loses_no_data():
     """An ordinary user loses the right to write to the folder during the recording: the recorder reports it, and
     nothing is lost.
     """
@@ -241,7 +241,7 @@ def hostile(board, link, said):
         terminal.unplug()
 
 
-def test_a_device_neither_steers_the_terminal_nor_ends_the_recorder_nor_writes_elsewhere(tmp_path):
+def test_hostile_devices_have_no_effect(tmp_path):
     places = {board: tmp_path / "ports" / f"tag{board}" for board in (1, 2)}
     out = tmp_path / "out" / "f.uwb"
     out.parent.mkdir()
@@ -261,7 +261,7 @@ def test_a_device_neither_steers_the_terminal_nor_ends_the_recorder_nor_writes_e
 
 
 @pytest.mark.parametrize(("command", "rest"), [("test", []), ("twr", ["2"]), ("cir", ["2"])])
-def test_a_command_to_a_hostile_device_ends_in_a_line(tmp_path, command, rest):
+def test_commands_to_hostile_devices_end_with_one_line(tmp_path, command, rest):
     with hostile(1, tmp_path / "tag1", SAID[:6]):
         done = processes.run("uwblink", command, tmp_path / "tag1", *rest, timeout=120)
     assert done.returncode in (0, 2)
@@ -313,7 +313,7 @@ class FloodingPort:
         pass
 
 
-def test_zeros_without_an_end_are_faults_and_no_memory():
+def test_endless_zeros_are_faults_and_need_no_memory():
     """Nothing is written, so that only the loop is measured."""
     ports, seen = Flooding(), Progress()
     recorder = Recorder({1: "1", 2: "2"}, uwblink.RangingPlan(((1, 2),)), ((1, 2),), [seen], ports=ports)

@@ -30,7 +30,7 @@ from uwblink.wire.codec import encode
         ("socket://127.0.0.1:1", PortError, "cannot be opened"),
     ],
 )
-def test_what_cannot_be_opened(tmp_path, name, error, said):
+def test_ports_that_cannot_be_opened_are_named(tmp_path, name, error, said):
     (tmp_path / "file").write_text("x")
     with pytest.raises(error, match=said.format(here=tmp_path)):
         SerialPort(name.format(here=tmp_path))
@@ -137,7 +137,7 @@ def test_all_leaves_out_pairs_on_one_body():
         ("pairs = [", "not valid TOML"),
     ],
 )
-def test_plans_that_cannot_be_played(tmp_path, text, fragment):
+def test_wrong_plan_files_are_refused(tmp_path, text, fragment):
     with pytest.raises(PlanError, match=one_line("plan.toml", fragment)):
         load_plan(written(tmp_path, text))
 
@@ -166,6 +166,6 @@ def test_tags_come_from_a_scenario_too(tmp_path):
         ({"pairs": "some"}, "pairs: found 'some'"),
     ],
 )
-def test_plans_that_cannot_be_are_refused_where_they_are_made(given, text):
+def test_wrong_plans_are_refused(given, text):
     with pytest.raises(PlanError, match=text):
         RangingPlan(**given)

@@ -45,13 +45,13 @@ def test_an_arrangement_is_marked_from_beginning_to_end(tmp_path):
         ({"arrangement": "A", "known": "ring"}, "known"),
     ],
 )
-def test_what_cannot_be_known_of_an_arrangement_is_refused(tmp_path, given, named):
+def test_impossible_arrangements_are_refused(tmp_path, given, named):
     with pytest.raises(PlanError, match=named):
         record_bench(tmp_path / "a.uwb", **given)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_plan_that_seats_other_boards_is_refused_before_anything_is_recorded(tmp_path):
+def test_plans_with_other_boards_are_refused_before_recording(tmp_path):
     others, own = (
         RangingPlan(tags=tuple(Tag(number, "drone", (0.1, 0.0, 0.0)) for number in numbers))
         for numbers in ((20, 10), (1,))
@@ -65,14 +65,14 @@ def test_a_plan_that_seats_other_boards_is_refused_before_anything_is_recorded(t
 
 
 @pytest.mark.parametrize("known", ["line 1 1", "plane 1 2", "line 1 b", "line  1"])
-def test_an_order_that_is_none_is_one_line(tmp_path, known):
+def test_wrong_orders_are_one_line(tmp_path, known):
     with Recording.create(tmp_path / "a.uwb", meta={}) as recording:
         recording.append("arrangements", [Arrangement("A", 0, 1, known)])
         with pytest.raises(RecordingError, match="known: found"):
             recording.arrangements()
 
 
-def test_what_the_boards_said_is_in_the_file_and_decodes_to_the_same(tmp_path):
+def test_bytes_of_boards_are_in_the_file_and_decode_to_its_exchanges(tmp_path):
     path, ports = tmp_path / "f.uwb", VirtualPorts(bench_scenario())
     done = record_bench(path, RangingPlan(rate_hz=100.0), ports, duration_s=1.5)
     exchanges, faults, frames, meta = stored(path)
@@ -136,7 +136,7 @@ def test_an_unplugged_board_leaves_the_others_running_and_resumes(tmp_path):
     assert np.any(again), "passive listening was lost with the power and is restored"
 
 
-def test_a_hanging_board_and_damage_on_the_line_are_faults_and_no_invented_ranges(tmp_path):
+def test_hanging_boards_and_damaged_lines_are_faults_without_wrong_ranges(tmp_path):
     path, counts = tmp_path / "f.uwb", Progress()
     faults = [
         {"kind": "hang", "tag": 3, "at_s": 0.5},

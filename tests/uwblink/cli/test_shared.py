@@ -57,7 +57,7 @@ def test_an_error_is_one_line_and_a_status(error, code, line, capsys):
     assert (end.value.code, capsys.readouterr().err) == (code, line)
 
 
-def test_numbers_beyond_numbers_are_an_error_and_not_a_result(capsys):
+def test_infinite_results_are_errors(capsys):
     def fail() -> None:
         print((np.array([1e300]) * 1e300)[0])
 
@@ -69,7 +69,7 @@ def test_numbers_beyond_numbers_are_an_error_and_not_a_result(capsys):
     assert (end.value.code, out, told) == (2, "", True)
 
 
-def test_an_error_of_nobody_is_not_swallowed():
+def test_unexpected_errors_are_raised():
     def fail() -> None:
         raise ZeroDivisionError
 
@@ -96,7 +96,7 @@ def test_python_m_is_the_command(package):
     assert re.fullmatch(r"Python 3\.[0-9.]+, numpy [0-9.]+, .*duckdb [0-9.]+, .*", beside)
 
 
-def test_the_library_speaks_of_parameters_and_each_has_its_flag():
+def test_parameters_of_the_library_have_flags():
     group = typer.main.get_command(app)
     options = {o for command in group.commands.values() for p in command.params for o in p.opts}  # type: ignore[attr-defined]
     options |= {"--map"}  # of `import csv`
@@ -149,7 +149,7 @@ start(command)
 """
 
 
-def test_a_command_that_is_done_keeps_its_status_when_it_is_interrupted():
+def test_finished_commands_keep_their_status_when_interrupted():
     done = subprocess.run([sys.executable, "-c", INTERRUPTED_AT_THE_END], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -222,7 +222,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_on_a_terminal_it_shows_text_and_share_and_goes(monkeypatch):
+def test_progress_on_a_terminal_is_shown_and_removed(monkeypatch):
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
     with waiting("fitting [1]") as update:
@@ -235,7 +235,7 @@ def test_on_a_terminal_it_shows_text_and_share_and_goes(monkeypatch):
     assert screen.getvalue().endswith("\x1b[2K")
 
 
-def test_elsewhere_it_shows_nothing(capsys):
+def test_progress_is_not_shown_elsewhere(capsys):
     with waiting("fitting") as update:
         update(0.5)
     assert capsys.readouterr() == ("", "")

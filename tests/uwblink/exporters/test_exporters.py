@@ -61,7 +61,7 @@ def test_trajectories(tmp_path):
     assert [line.split()[0] for line in other.splitlines()] == ["-1.500000000", "-0.250000000", "0.750000000"]
 
 
-def test_what_cannot_be_exported_leaves_nothing(whole, tmp_path):
+def test_failed_exports_leave_no_files(whole, tmp_path):
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "mine").write_text("mine")
     before = sorted(tmp_path.rglob("*"))
@@ -80,7 +80,7 @@ def test_what_cannot_be_exported_leaves_nothing(whole, tmp_path):
     assert sorted(path.stem for path in (tmp_path / "there").iterdir()) == sorted(TABLES)
 
 
-def test_a_folder_that_is_no_export(whole, tmp_path):
+def test_folders_without_an_export_are_not_replaced(whole, tmp_path):
     with pytest.raises(ImportTableError, match=r"contains no exchanges\.csv"):
         import_recording(tmp_path, tmp_path / "o.uwb", importer="exported")
     export_recording(whole, tmp_path / "out", to="csv")
@@ -96,7 +96,7 @@ def test_a_folder_that_is_no_export(whole, tmp_path):
     assert not (tmp_path / "o.uwb").exists()
 
 
-def test_a_form_of_ones_own(whole, tmp_path):
+def test_registered_exporters_are_used(whole, tmp_path):
     def write(recording, folder):
         (folder / "name.txt").write_text(recording.name)
         return {"name.txt": 1}
@@ -138,7 +138,7 @@ BY_HAND = [np.hypot(0.5 + 2 * 0.001, 3.0), 7.25]
 
 
 @pytest.mark.parametrize("to", ["csv", pytest.param("parquet", marks=pytest.mark.slow)])
-def test_true_distances_are_those_of_the_poses_where_none_was_measured(flown, tmp_path, to):
+def test_missing_true_distances_are_those_of_the_poses(flown, tmp_path, to):
     export_recording(flown, tmp_path / "out", to=to)
     with duckdb.connect() as db:
         query = f"SELECT truth_m, truth_from FROM read_{to}(?)"
@@ -267,7 +267,7 @@ def test_every_message_is_there_in_order_of_time(recording, tmp_path):
         ("rosbag2", 5, 1e39, 1.0, r"r\.uwb: /uwb/range_1_2: has a number that is .*too large"),
     ],
 )
-def test_what_messages_cannot_say_is_one_line(tmp_path, to, time_ns, range_m, x, said):
+def test_values_that_messages_cannot_hold_are_one_line(tmp_path, to, time_ns, range_m, x, said):
     sample = Exchanges.from_arrays([1], [2], time_ns=[time_ns], range_m=[range_m], tx1=[0], rx1=[5], tx2=[9], rx2=[30])
     poses = Poses(np.array([9]), np.array(["drone"]), np.array([[x, 1.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))
     Contents(exchanges=sample, poses=poses).save(tmp_path / "r.uwb")
@@ -295,7 +295,7 @@ def corrected(tmp_path_factory):
 
 
 @pytest.mark.parametrize("form", ["csv", pytest.param("parquet", marks=pytest.mark.slow)])
-def test_corrected_ranges_leave_with_what_is_known_of_each(corrected, tmp_path, form):
+def test_corrected_ranges_are_exported_with_their_expected_errors(corrected, tmp_path, form):
     folder, exchanges, known, applied = corrected
     calib.apply(folder / "f.uwb", known, tmp_path / "out", to=form)
     frame = {"csv": pd.read_csv, "parquet": pd.read_parquet}[form](tmp_path / "out" / f"corrected.{form}")

@@ -186,7 +186,7 @@ def test_both_ids_in_names_of_topics_may_be_words(tmp_path):
         assert ({(one, str(other)[-1]) for one, other in got}, len(got)) == (set(pairs), len(PLANT))
 
 
-def test_one_id_in_names_of_topics_is_the_one_that_is_not_in_the_messages(tmp_path):
+def test_ids_in_names_of_topics_complete_those_in_messages(tmp_path):
     """Or the id in the names; an id of a robot differs from an id of the anchors in its messages."""
     topics = {f"/robot{k}/uwb": (MINE, of_anchor(k, as_mine)) for k in range(4)}
     found = by_guess(tmp_path, ros2(tmp_path / "fields", topics))
@@ -280,7 +280,7 @@ def test_the_commands_end_with_true_distances(tmp_path):
     assert set(load(tmp_path / "b.uwb").poses.body) == {"drone", "anchor0", "anchor1", "anchor2", "anchor3"}
 
 
-def test_without_poses_the_command_says_what_can_be_had(tmp_path):
+def test_without_poses_the_command_prints_possible_commands(tmp_path):
     ros2(tmp_path / "b", RANGES)
     said = processes.succeed(*GUESS, "b", "-o", "map.toml", cwd=tmp_path).stdout
     assert all(words in said for words in ("calib survey", "fit_from_ranges", "constants of pairs need true"))
@@ -313,7 +313,7 @@ TEXTS = ["[" * 100_000, '{"a":' * 700 + "1" + "}" * 700, "[1, 2]", '{"ranges": [
 
 
 @pytest.mark.parametrize("text", TEXTS)
-def test_texts_that_are_no_ranges_are_one_line(tmp_path, text):
+def test_messages_without_ranges_are_one_line(tmp_path, text):
     def texts(store, _):
         return ((START + k * 10**8, store.types[TEXT](text)) for k in range(12))
 

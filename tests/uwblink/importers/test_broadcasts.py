@@ -90,7 +90,7 @@ def test_every_reception_comes_from_the_lists_and_exchanges_from_receptions(tmp_
     assert 6 * 900 < len(found.exchanges) < len(found.overheard["time_ns"])
 
 
-def test_numbers_that_begin_anew_are_other_frames(tmp_path):
+def test_restarted_frame_numbers_are_other_frames(tmp_path):
     first, second = broadcasts(rounds=60), broadcasts(rounds=60, slot_s=0.007)
     found = imported(tmp_path, printed(first) + printed(second))
     assert len(found.exchanges) > 6 * 2 * 50
@@ -149,7 +149,7 @@ def test_recorded_boards_give_the_ranges_of_their_description(recorded):
         assert ours.std() < 0.04
 
 
-def test_a_lossy_run_has_no_range_that_its_stamps_do_not_support(recorded):
+def test_lossy_logs_have_no_wrong_ranges(recorded):
     """Seven boards stand still, and one in forty of their stamps is wrong by up to 110 m."""
     e = load(recorded(70)).exchanges
     assert len(e) > 0.96 * 496, "as many as there are with every stamp"
@@ -194,7 +194,7 @@ def test_halves_of_a_run_agree_within_their_intervals(recorded, run, first):
         (70, "exchanges"),
     ],
 )
-def test_a_geometry_that_was_made_up_is_refuted(recorded, tmp_path, run, use):
+def test_invented_geometry_is_refused(recorded, tmp_path, run, use):
     shutil.copy(recorded(run), tmp_path / "q.uwb")
     (tmp_path / "grid.toml").write_text(
         "".join(f"[[anchors]]\nid = {k + 1}\nposition_m = [{k % 2}, {k // 2}, 1.0]\n" for k in range(7))

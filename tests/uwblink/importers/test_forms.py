@@ -323,7 +323,7 @@ RARER = (
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in RARER)) for name in FORMS])
-def test_a_form_comes_in_by_its_guess(tmp_path, name):
+def test_forms_are_imported_by_their_guess(tmp_path, name):
     form = FORMS[name]
     (tmp_path / "in").mkdir()
     found = guessed(tmp_path, form.write(tmp_path / "in"), form.answers)
@@ -378,7 +378,7 @@ def test_words_in_a_column_that_is_not_needed_are_named(tmp_path, column):
 
 
 @pytest.mark.parametrize("value", [0, *(pytest.param(v, marks=pytest.mark.slow) for v in (-1, 65535)), 9999.9])
-def test_a_number_that_often_stands_for_no_range_is_refused_until_the_map_states_it(tmp_path, value):
+def test_frequent_placeholders_of_ranges_are_refused_until_the_map_states_them(tmp_path, value):
     text = LONG + "".join(f"{k},1,2,{value if k % 5 == 0 else 3 + k / 7},\n" for k in range(60))
     with pytest.raises(ImportTableError, match=rf"20.0% of its numbers are {value}.* missing = \[{value}"):
         imported(tmp_path, text)
@@ -442,7 +442,7 @@ def test_powers_that_no_chip_reports_are_refused(tmp_path):
     assert len(imported(tmp_path, text, map_text.replace("dw1000", "other")).exchanges) == 30
 
 
-def test_places_state_their_units(tmp_path):
+def test_positions_have_units(tmp_path):
     text = "".join(f"[{500 * k}] AN {k % 3}: {2000 + 7 * k} mm\n" for k in range(30))
     map_text = 'line = "[{time_ms}] AN {to_id}: {range_mm} mm"\nfrom_name = "tag{from_id}_{gt_range_cm}cm.log"\n'
     found = imported(tmp_path, text, map_text, "tag7_250cm.log").exchanges

@@ -106,7 +106,7 @@ NAMES = [f"c{k}" for k in range(5000)]
     ],
     ids=["columns", "fields", "ends of two letters", "long names"],
 )
-def test_columns_beyond_number_and_lines_without_end(tmp_path, name, text):
+def test_tables_with_too_many_columns_or_too_long_lines_are_refused(tmp_path, name, text):
     (tmp_path / name).write_text(text)
     refused(tmp_path / name)
 
@@ -146,7 +146,7 @@ def test_a_plug_in_that_fails_is_one_line_with_its_name(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.flux", "t.csv", "t.uwb"]
 
 
-def test_the_file_that_was_given_is_named_and_not_what_a_plug_in_made_of_it(tmp_path):
+def test_errors_name_the_given_file(tmp_path):
     def tables(_sources, _map, folder):
         (folder / "flux.csv").write_text(HEAD)
         return [folder / "flux.csv"], ColumnMap()
@@ -233,7 +233,7 @@ def test_a_table_without_any_device_says_so(tmp_path, layout):
 
 
 @pytest.mark.parametrize(("layout", "missing"), [("messages", "tx"), ("stamps", "event")])
-def test_what_a_layout_needs_is_said(tmp_path, layout, missing):
+def test_missing_columns_of_a_layout_are_named(tmp_path, layout, missing):
     lines = [{n: v for n, v in line.items() if n != missing} for line in lines_of(layout)]
     with pytest.raises(ImportTableError, match=f"column '{missing}' is missing"):
         read_rows(tmp_path, lines, f'layout = "{layout}"')

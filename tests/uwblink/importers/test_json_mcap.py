@@ -41,7 +41,7 @@ def exported(tmp_path):
     return held, tmp_path / "out" / "recording.mcap"
 
 
-def test_ranges_come_in_again_without_a_map(exported):
+def test_exported_ranges_are_imported_without_a_map(exported):
     held, path = exported
     found = read_source(path).exchanges
     names = "time_ns initiator target range_m truth_m fpp1_dbm fpp2_dbm skew1_ppm skew2_ppm"
@@ -50,7 +50,7 @@ def test_ranges_come_in_again_without_a_map(exported):
     assert not found.tx1.any()
 
 
-def test_poses_come_in_again(exported):
+def test_exported_poses_are_imported(exported):
     held, path = exported
     found = read_poses(path)
     for name in ("time_ns", "body", "position_m"):
@@ -109,7 +109,7 @@ def posed(x=1.0, sec=1):
         (posed(sec=10**30), "is no foxglove.PoseInFrame"),
     ],
 )
-def test_what_is_no_pose_is_one_line(tmp_path, message, said):
+def test_wrong_poses_are_one_line(tmp_path, message, said):
     path = written(tmp_path / "t.mcap", {"/poses/a": [message]}, "foxglove.PoseInFrame")
     with pytest.raises(ImportTableError, match=said):
         read_poses(path)

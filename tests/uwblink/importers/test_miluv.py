@@ -144,7 +144,7 @@ def test_without_files_of_places_the_measured_distance_is_the_truth(flight, tmp_
     assert e.time_ns[0] == 1_000_000_000
 
 
-def test_a_row_with_a_hole_is_a_fault(flight, tmp_path):
+def test_rows_with_missing_cells_are_faults(flight, tmp_path):
     path = flight[0] / "ifo001" / "uwb_range.csv"
     rows = list(csv.DictReader(path.read_text().splitlines()))
     rows[1]["rx2_raw"] = ""
@@ -175,7 +175,7 @@ def test_a_folder_that_cannot_be_used_is_one_line_and_no_file(flight, tmp_path, 
     assert not (tmp_path / "o.uwb").exists()
 
 
-def test_a_constellation_that_is_not_there(flight, tmp_path):
+def test_missing_constellations_are_named(flight, tmp_path):
     for text, said in (('constellation = "7"', "there are 0, 1"), ("constellation = 7", "constellation: found 7")):
         with pytest.raises(ImportTableError, match=said):
             imported(flight[0], tmp_path, text)

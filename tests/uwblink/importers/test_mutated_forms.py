@@ -181,7 +181,7 @@ MAKERS = (mutated_long, mutated_long, mutated_wide, mutated_wide, mutated_stamps
 
 
 @pytest.mark.parametrize("seeds", [range(10), pytest.param(range(10, 200), marks=pytest.mark.slow)], ids=str)
-def test_no_mutated_file_comes_in_wrong(tmp_path, seeds):
+def test_no_mutated_file_is_imported_wrongly(tmp_path, seeds):
     outcomes = {"asked": 0, "refused": 0, "right": 0}
     for k in seeds:
         rng = random.Random(k)

@@ -120,7 +120,7 @@ def test_trajectories_of_several_bodies_and_anchors(recording, tmp_path):
     np.testing.assert_allclose(true_m[:2], [4.0, np.hypot(3.0, 0.1)])
 
 
-def test_anchors_that_cannot_be(recording, tmp_path):
+def test_wrong_anchors_are_refused(recording, tmp_path):
     for text, fragment in (
         ("[[anchors]]\nid = 9\n", "anchors[0].position_m"),
         ("[[anchors]]\nid = 9\nposition_m = [1, 2]\n", "three numbers"),

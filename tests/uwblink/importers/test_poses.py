@@ -79,7 +79,7 @@ def test_rows_in_which_motion_capture_lost_a_body_are_left_out(tmp_path, cell):
         ("a.xyz", "", "expected one of"),
     ],
 )
-def test_files_that_hold_no_poses(tmp_path, name, text, fragment):
+def test_files_without_poses_are_refused(tmp_path, name, text, fragment):
     (tmp_path / name).write_text(text)
     with pytest.raises(ImportTableError, match=one_line(fragment)):
         read_poses(tmp_path / name, "drone" if "cells" in fragment else None)
@@ -116,7 +116,7 @@ def test_auto_finds_the_offset_from_the_ranges(flight, copied):
     assert (len(held.poses), held.meta["poses_offset_s"]) == (found.poses, pytest.approx(found.offset_s))
 
 
-def test_the_command_says_what_it_did_and_refuses_what_cannot_be(flight, copied, tmp_path):
+def test_the_command_prints_its_result_and_refuses_wrong_options(flight, copied, tmp_path):
     said = processes.run("uwblink", "poses", copied, "--from", flight / "p.csv", "--offset", "-3.21").stdout
     assert "1660 of 1660 measurements have a true distance" in said
     done = processes.run("uwblink", "poses", copied, "--from", flight / "p.csv", "--offset", "soon", "--force")
@@ -140,7 +140,7 @@ def scaled(path, factor, output):
     return output
 
 
-def test_poses_that_are_there_stay_unless_they_are_to_be_replaced(flight, copied):
+def test_existing_poses_are_replaced_only_with_force(flight, copied):
     for offset, force in (("-3.21", False), ("-3.1", True)):
         add_poses(copied, flight / "p.csv", offset=offset, force=force)
         assert uwblink.load(copied).meta["poses_offset_s"] == pytest.approx(float(offset))

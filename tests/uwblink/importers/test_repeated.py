@@ -75,7 +75,7 @@ def test_ranges_without_stamps_that_both_devices_logged_are_merged(tmp_path, see
     assert note.startswith(f"{len(rows) - 317} of {len(rows)} ranges repeat")
 
 
-def test_ranges_that_are_repeated_from_the_same_end_are_told_and_kept(tmp_path):
+def test_repeated_ranges_of_one_end_are_noted_and_kept(tmp_path):
     rows = plain(317, 0.05, 0.004, 0.39, 0)
     rows = [
         row | {"from_id": min(row["from_id"], row["to_id"]), "to_id": max(row["from_id"], row["to_id"])} for row in rows
@@ -86,7 +86,7 @@ def test_ranges_that_are_repeated_from_the_same_end_are_told_and_kept(tmp_path):
 
 
 @pytest.mark.parametrize(("quantum", "noise"), [(0.1, 0.03), (0.01, 0.0)])
-def test_ranges_that_are_equal_by_chance_are_not_told(tmp_path, quantum, noise):
+def test_ranges_that_are_equal_by_chance_are_not_noted(tmp_path, quantum, noise):
     assert not read_rows(tmp_path, plain(600, 0.05, 0, 0, 1, quantum, noise)).meta["notes"]
 
 
@@ -125,7 +125,7 @@ def test_devices_without_antenna_delays_are_read_beside_true_distances(tmp_path,
     assert len(found.meta["notes"]) == (not said)
 
 
-def test_a_guess_says_that_nothing_was_programmed(tmp_path):
+def test_guesses_state_missing_antenna_delays(tmp_path):
     for rows, ticks in ((undelayed(flights()), 0), (flights(), PROGRAMMED)):
         path = write(tmp_path / "t.csv", with_truth(rows))
         found = read_table(path, mapped(tmp_path, guess_map(path).text))
@@ -140,7 +140,7 @@ def test_one_device_without_antenna_delays(tmp_path):
     assert found.meta["configured_antenna_delay_ticks_by_tag"] == {"2": {"tx": 0, "rx": 0}}
 
 
-def test_what_a_map_says_of_antenna_delays_is_not_overruled(tmp_path):
+def test_antenna_delays_of_a_map_have_priority(tmp_path):
     rows = with_truth(undelayed(flights()))
     with pytest.raises(ImportTableError, match="antenna_delays"):
         read_rows(tmp_path, rows, f"[antenna_delays]\ntx = {PROGRAMMED}\nrx = {PROGRAMMED}\n")

@@ -89,7 +89,7 @@ def read_rows(tmp_path, rows, text=None):
     return read_table(write(tmp_path / "t.csv", rows), None if text is None else mapped(tmp_path, text))
 
 
-def test_poses_are_told_from_exchanges(tmp_path):
+def test_poses_and_exchanges_are_distinguished(tmp_path):
     rows = [dict.fromkeys(("time_s", "body", "x", "y", "z", "qx", "qy", "qz", "qw"), 1)] * 3
     with pytest.raises(ImportTableError, match="these are poses, which `uwblink poses` adds to"):
         read_rows(tmp_path, rows)
@@ -144,7 +144,7 @@ def test_the_width_is_found_and_signed_stamps_are_read(tmp_path, bits):
     assert f"stamps are signed, and are taken modulo 2^{bits}" in found.meta["notes"]
 
 
-def test_the_protocol_is_found_where_the_columns_do_not_tell(tmp_path):
+def test_the_protocol_is_found_by_the_stamps(tmp_path):
     rows = flights(third="initiator")
     write(tmp_path / "t.csv", wrapped(rows))
     found = read_table(tmp_path / "t.csv")
@@ -206,7 +206,7 @@ def test_iso_times_names_and_programmed_delays(tmp_path):
     assert abs(int(found.exchanges.time_ns[0]) - 1714972090_000000000) < 1000
 
 
-def test_headers_that_two_columns_share_and_nobody_uses(tmp_path):
+def test_unused_repeated_headers_are_accepted(tmp_path):
     rows = flights()
     lines = write(tmp_path / "t.csv", wrapped(rows)).read_text().splitlines()
     (tmp_path / "t.csv").write_text(
@@ -217,12 +217,12 @@ def test_headers_that_two_columns_share_and_nobody_uses(tmp_path):
         read_table(tmp_path / "t.csv", mapped(tmp_path, '[columns]\nskew1 = "note"\n'))
 
 
-def test_what_the_device_reported_is_kept_beside_the_stamps(tmp_path):
+def test_reported_ranges_are_kept_with_stamps(tmp_path):
     rows = [{**row, "range_m": "" if k else 7.5} for k, row in enumerate(wrapped(flights()))]
     assert read_rows(tmp_path, rows).exchanges.range_m[:2] == pytest.approx([7.5, flights()[1]["truth"]])
 
 
-def test_no_time_at_all(tmp_path):
+def test_tables_without_times_are_read(tmp_path):
     rows = [{n: v for n, v in row.items() if n != "time_s"} for row in wrapped(flights())]
     found = read_rows(tmp_path, rows)
     assert found.exchanges.time_ns[:3].tolist() == [0, 1_000_000, 2_000_000]
@@ -284,7 +284,7 @@ def as_messages(rows, third="target"):
         *(pytest.param(*one, marks=pytest.mark.slow) for one in (("initiator", ("seq",)), ("target", ("message",)))),
     ],
 )  # fmt: skip
-def test_a_row_a_message(tmp_path, third, without):
+def test_tables_with_a_row_per_message_are_read(tmp_path, third, without):
     rows = flights(third=third)
     lines = [{n: v for n, v in line.items() if n not in without} for line in as_messages(wrapped(rows), third)]
     if "time_s" not in without:
@@ -306,7 +306,7 @@ def test_a_message_that_got_lost_is_a_fault_not_another_exchange(tmp_path):
     assert (len(found.exchanges), [fault.detail.split(",")[0] for fault in found.faults]) == (59, ["row 8"])
 
 
-def test_two_rows_an_exchange(tmp_path):
+def test_tables_with_two_rows_per_exchange_are_read(tmp_path):
     rows, at_target = flights(), dict.fromkeys(("rx1", "tx2", "tx3"), "")
     lines = []
     for k, row in enumerate(wrapped(rows)):
@@ -393,7 +393,7 @@ def test_duckdb_may_open_the_named_file_only(tmp_path):
         ('[columns]\nevil = "tx1"', "columns.evil: unknown key"),
     ],
 )
-def test_maps_that_cannot_be(tmp_path, text, fragment):
+def test_wrong_maps_are_refused(tmp_path, text, fragment):
     write(tmp_path / "t.csv", wrapped(flights()))
     with pytest.raises(ImportTableError, match=one_line(fragment)):
         import_recording(tmp_path / "t.csv", tmp_path / "o.uwb", map_file=mapped(tmp_path, text))
@@ -411,7 +411,7 @@ def test_maps_that_cannot_be(tmp_path, text, fragment):
         ("t.csv", b"\n"),
     ],
 )
-def test_files_that_cannot_be(tmp_path, name, content):
+def test_wrong_files_are_refused(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ImportTableError, match=one_line()):
         read_table(tmp_path / name)
@@ -437,7 +437,7 @@ def test_every_unit_of_times(tmp_path, unit, scale):
     assert found.time_ns.tolist() == [10**10 + k * 250_000_000 for k in range(60)]
 
 
-def test_half_of_the_rows_end_an_import(tmp_path):
+def test_imports_with_half_of_the_rows_faulty_are_refused(tmp_path):
     rows = wrapped(flights())
     assert len(read_rows(tmp_path, [row | {"tx2": ""} for row in rows[:29]] + rows[29:]).exchanges) == 31
     with pytest.raises(ImportTableError, match="row 2"):

@@ -98,7 +98,7 @@ def test_a_copy_has_every_row_of_every_table(full, tmp_path, monkeypatch, at_a_t
 
 
 @pytest.mark.parametrize("first", range(4))
-def test_only_what_is_replaced_differs(full, tmp_path, first):
+def test_only_replaced_tables_differ(full, tmp_path, first):
     """Every fourth table is replaced: each table is replaced once."""
     instead = {table: INSTEAD[table] for table in list(INSTEAD)[first::4]}
     with Recording.open(full) as source:
@@ -210,6 +210,6 @@ def test_it_prints_itself_on_a_screen():
         ({"pairs": [1, 2]}, "pairs: found .*, expected pairs of initiator and target"),
     ],
 )
-def test_what_cannot_be_selected_says_so(wrong, expected):
+def test_wrong_selections_are_refused(wrong, expected):
     with pytest.raises(ArgumentError, match=expected):
         made().select(**wrong)

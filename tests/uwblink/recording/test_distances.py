@@ -31,7 +31,7 @@ def test_distances_are_those_of_antennas_on_their_way(begin, end, stands, time_n
 
 
 @pytest.mark.parametrize(("step_m", "stands"), [(0.1, False), (0.0, True)])
-def test_a_body_that_moves_is_nowhere_where_its_poses_have_a_gap(step_m, stands):
+def test_positions_in_gaps_of_poses_are_unknown(step_m, stands):
     seconds = np.r_[0:2:0.1, 5:7:0.1]
     poses = Poses.from_arrays(
         [*(seconds * 1e9).astype(int), 0],

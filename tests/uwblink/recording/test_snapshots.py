@@ -70,7 +70,7 @@ def test_what_any_writer_has_committed_is_read_and_not_updated(writer):
     assert sorted(p.name for p in writer.parent.iterdir()) == ["f.uwb", "f.uwb.wal"]
 
 
-def test_of_a_log_that_was_copied_while_it_grew_whole_commits_are_read(writer, tmp_path):
+def test_copied_logs_are_read_up_to_the_last_complete_commit(writer, tmp_path):
     copy, log = tmp_path / "copy.uwb", (tmp_path / "f.uwb.wal").read_bytes()
     copy.write_bytes(writer.read_bytes())
     for share in (0.0, 0.1, 0.5, 0.77, 0.999):
@@ -82,7 +82,7 @@ def test_of_a_log_that_was_copied_while_it_grew_whole_commits_are_read(writer, t
 
 
 @pytest.mark.parametrize("changing", [True, False])
-def test_a_copy_that_cannot_be_made_is_an_error_of_the_reader_alone(writer, monkeypatch, changing):
+def test_failed_copies_are_errors_of_the_reader_only(writer, monkeypatch, changing):
     def copy(source, _target):
         if not changing:
             raise OSError(28, "No space left on device")

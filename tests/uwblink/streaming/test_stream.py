@@ -112,7 +112,7 @@ def test_a_recording_of_another_protocol_and_stamp_size_is_corrected_as_apply_do
     assert [one.corrected_m for one in played] == expected.tolist()
 
 
-def test_a_tag_that_is_not_calibrated_is_told_before_the_first_range(tmp_path, flown, of_two):
+def test_uncalibrated_tags_are_named_before_the_first_range(tmp_path, flown, of_two):
     with pytest.raises(ValueError, match=r"two\.json: no delay of tag 3"):
         uwblink.stream(flown, calibration=of_two)
     with pytest.raises(PlanError, match="no delay of tag 3"):
@@ -126,7 +126,7 @@ def test_a_tag_that_is_not_calibrated_is_told_before_the_first_range(tmp_path, f
     assert all(math.isfinite(one.corrected_m) for one in found)
 
 
-def test_what_a_correction_raises_while_boards_range_is_told_and_what_came_before_is_kept(tmp_path):
+def test_errors_of_corrections_end_streams_and_keep_earlier_ranges(tmp_path):
     def correct(exchanges):
         if exchanges.tx1.any() and next(seen) == 20:
             raise ValueError("the calibration is broken")
@@ -165,7 +165,7 @@ def test_a_recording_plays_in_its_own_time(flown, clock):
         ({"calibration": "no.json"}, "no.json"),
     ],
 )
-def test_what_cannot_be_is_said_before_the_first_range(flown, more, named):
+def test_wrong_arguments_are_refused_before_the_first_range(flown, more, named):
     with pytest.raises((ArgumentError, PlanError), match=named):
         uwblink.stream(flown, **more)
 
@@ -283,7 +283,7 @@ def difference_of(contents, row, delays_ns):
     return (e["time_ns"], e["initiator"], e["target"], h["listener"]), raw, raw + c * delays_ns[e["target"]] - of_range
 
 
-def test_what_boards_overhear_is_streamed_with_the_ranges(overheard, tmp_path):
+def test_overheard_differences_are_streamed_with_ranges(overheard, tmp_path):
     delays_ns = {1: 0.25, 2: 0.0, 3: -0.25}
     path = tmp_path / "flat.json"
     zero, flat = ({"knots": [0.0] * 4 + [9.0] * 4, "coefficients": [v] * 4, "degree": 3} for v in (0.0, 0.05))
@@ -318,7 +318,7 @@ def test_the_command_prints_differences_in_lines_of_their_own(overheard, calibra
 
 
 @pytest.mark.parametrize(("which", "options"), [("flown", "-c {c}"), ("overheard", ""), ("port", "--dialect arduino")])
-def test_what_cannot_stream_differences(request, calibration, which, options):
+def test_streams_that_cannot_have_differences_are_refused(request, calibration, which, options):
     source = which if which == "port" else request.getfixturevalue(which)
     words = ["uwblink", "stream", source, "--use", "receptions", *options.format(c=calibration).split()]
     processes.refuse(*words, naming=["--use"], status=2)

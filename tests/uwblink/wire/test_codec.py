@@ -192,7 +192,7 @@ def test_values_that_do_not_fit_are_refused(message, text):
 REPORT = b"R05|2|3.0550|2334148660|1211574983|1233803316|2356378373|1332123700|2454699099|-87.4977|-87.5239|-3.4971|3.5222\r\n"  # noqa: E501 - as captured
 
 
-def test_a_decoder_says_what_has_begun():
+def test_decoders_state_the_start_of_messages():
     decoder = Decoder(m.REPORTS)
     for data, begun in ((b"", b""), (b"S10|1|2|7", m.Cir.KEY), (b"|x\r\n", b"")):
         decoder.feed(data)
@@ -225,11 +225,11 @@ def test_in_the_middle_of_damage_nothing_has_begun():
         (b"R01|07\r\n", []),
     ],
 )
-def test_what_is_understood_of_damage(data, messages):
+def test_damaged_lines_are_decoded_or_skipped(data, messages):
     assert understood(decode(data, m.REPORTS)) == messages
 
 
-def test_a_line_is_waited_for_up_to_8191_bytes():
+def test_lines_may_have_8191_bytes():
     assert LONGEST_LINE == 8192
     decoder = Decoder(m.REPORTS)
     assert (decoder.feed(b"R05|" + b"1" * 8187), decoder.skipped_bytes, decoder.begun) == ([], 0, b"R05")
@@ -295,7 +295,7 @@ def test_numbers_are_printed_below_ten_billion_and_cut():
         (BYTES.write, bytes(1001), "1001 bytes, at most 1000"),
     ],
 )
-def test_what_cannot_be_written(write, value, said):
+def test_values_that_cannot_be_written_are_refused(write, value, said):
     with pytest.raises(FrameError, match=said):
         write(value)
 
@@ -420,7 +420,7 @@ SAMPLE = Weather(7, "roof", -3.5, b"|\r\nR05|", wet=True)
 LINE = b"R42|7|roof|-3.5000|\x07\x00|\r\nR05||1\r\n"
 
 
-def test_it_is_written_and_read_whole_byte_by_byte_and_among_others():
+def test_registered_messages_are_written_and_read():
     assert (encode(SAMPLE), decode(LINE, REPORTS), decode(LINE, REPORTS, [1] * len(LINE))) == (LINE, [SAMPLE], [SAMPLE])
     assert decode(b"R00\r\n" + LINE + b"R01|5\r\n", REPORTS)[1] == SAMPLE
     assert decode(encode(GetWeather(1.5)), COMMANDS) == [GetWeather(1.5)]
@@ -473,7 +473,7 @@ class Another(Message):
         (SAMPLE, "expected a class made with @message"),
     ],
 )
-def test_what_cannot_be_a_message_is_refused(kind, expected):
+def test_wrong_messages_are_refused(kind, expected):
     with pytest.raises(ArgumentError, match=expected):
         register_message(kind)
     assert REPORTS[b"R05"] is RangeReport

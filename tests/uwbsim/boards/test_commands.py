@@ -58,7 +58,7 @@ def test_a_new_command_is_one_message_class_and_one_executor(voltage):
     assert ports.transfers.maxlen == 20_000, "what boards sent long ago is not kept"
 
 
-def test_an_executor_may_take_its_time_and_may_fail(voltage):
+def test_slow_and_failing_executors_are_allowed(voltage):
     def slowly(board, factor, name):
         tries.append(int(board.bench.env.now))
         yield board.bench.env.timeout(3 * NS_PER_MS)
@@ -117,7 +117,7 @@ def test_numbers_are_read_as_c_reads_them(text, number):
         (b"C03|1|" + b"a" * 196 + b"|1|\0\0\0\0|" + b"\x2a\0" + b"x" * 42 + b"\r", [m.DoTests], True),
     ],
 )
-def test_what_boards_take_otherwise_than_the_firmware_is_what_the_page_says(data, kinds, alive):
+def test_differences_from_the_firmware_are_those_on_the_page(data, kinds, alive):
     """docs/boards.md lists them; the last has 255 bytes."""
     reading = read_commands(data)
     assert ([command.kind for command in reading.commands], reading.alive) == (kinds, alive)
@@ -153,12 +153,12 @@ def test_the_last_command_of_a_buffer_keeps_its_values():
         (-0.00001, b"-0.0000"),
     ],
 )
-def test_floats_that_are_none_are_printed_as_the_processor_prints_them(value, printed):
+def test_nan_and_infinity_are_printed_like_the_processor(value, printed):
     assert printed_float(value) == printed
 
 
 @pytest.mark.parametrize("raw", [b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", b"\x00\x00\x80\xff", b"\xff\xff\x7f\x7f"])
-def test_a_number_that_is_none_does_not_stop_the_bench(raw):
+def test_nan_does_not_stop_the_bench(raw):
     ports = uwbsim.VirtualPorts(bench_scenario())
     ports.bench.boards[1].write(b"C03|1|a|1|" + raw + b"|\x01\x00x\r")
     ports.bench.advance(5 * NS_PER_MS)

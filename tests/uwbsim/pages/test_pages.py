@@ -90,7 +90,7 @@ def folder(tmp_path_factory):
 
 @pytest.mark.parametrize("width", [pytest.param(1280, marks=pytest.mark.slow), 390])
 @pytest.mark.parametrize("name", ["scene", "out/compare"])
-def test_pages_lie_well(width, name, folder, tmp_path):
+def test_pages_of_simulations_fit_into_windows(width, name, folder, tmp_path):
     page = (folder / f"{name}.html").read_text()
     lies_well(page, width, tmp_path)
     # Boards on a bench have one distance and one power, so no figure is drawn over these.
@@ -98,7 +98,7 @@ def test_pages_lie_well(width, name, folder, tmp_path):
     assert ("log axis" in page) == ("logarithmic beyond" in page) == (name == "out/compare")
 
 
-def test_a_comparison_has_tables_and_json_and_takes_the_place_of_no_other(folder):
+def test_comparisons_have_tables_and_json_and_replace_no_files(folder):
     said = json.loads((folder / "told.json").read_text())["protocols"]
     assert [row["protocol"] for row in said] == list(PROTOCOLS)
     assert {p.name for p in (folder / "out").iterdir()} == {"compare.html", "compare.csv", "compare.parquet"}
@@ -107,7 +107,7 @@ def test_a_comparison_has_tables_and_json_and_takes_the_place_of_no_other(folder
     processes.refuse("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 10, naming=["--force"])
 
 
-def test_figures_for_a_paper_stand_in_a_folder_of_their_own_and_take_the_place_of_no_others(tmp_path, monkeypatch):
+def test_figures_for_papers_have_their_own_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "drawn", pages.outline)
     words = ["uwbsim", "compare", BENCH, "-n", 10, "--figures", tmp_path / "paper", "-o"]
     processes.succeed(*words, tmp_path / "out")
@@ -155,7 +155,7 @@ def judged(flight):
         ("'compare', ranges = 50", "", "Figure 3. bias (cm): mean error of raw ranges."),
     ],
 )
-def test_a_sweep_draws_what_came_out_and_says_what_it_is(tmp_path, kind, more, caption):
+def test_sweeps_draw_their_results_with_labels(tmp_path, kind, more, caption):
     head = f"sweep = {{ scenario = '{BENCH.as_posix()}', kind = {kind}, protocols = ['ds'], seeds = 3 }}"
     (tmp_path / "plan.toml").write_text(f"{head}\n[vary]\n'radio.rx_noise_ps' = [50.0, 100.0, 200.0]\n{more}\n")
     design = uwbsim.load_design(tmp_path / "plan.toml", allow_files=[BENCH.parent])

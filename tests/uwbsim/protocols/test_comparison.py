@@ -27,7 +27,7 @@ def scenario():
     return load(TEST1)
 
 
-def test_predicted_stands_beside_simulated(scenario):
+def test_predictions_agree_with_simulations(scenario):
     found = compare(scenario, ROWS, 300_000)
     outcomes, samples = found.outcomes, found.samples
     assert [o.protocol for o in outcomes] == list(PROTOCOLS)
@@ -49,7 +49,7 @@ def test_an_exchange_takes_what_its_frames_and_replies_take(scenario):
     assert ss["air_s"] < ss["radio_on_s"] < 2 * ss["duration_s"]
 
 
-def test_the_table_says_which_wins_where(scenario):
+def test_tables_name_the_best_protocol(scenario):
     rows = compare(scenario, ["ss-cfo", "ds"], 100).winners
     # With short replies, the carrier integrator has little effect, and double-sided ranging loses its short third
     # interval.
@@ -133,6 +133,6 @@ def test_predict_and_optimum_answer_in_words_and_json(tmp_path):
         (["run", TEST1, "-o", "o.uwb", "--through-wire", "--set", "ranging.protocol=ds-sym"], ["ds-sym", "boards"]),
     ],
 )
-def test_what_cannot_be_is_one_line(tmp_path, words, fragments):
+def test_wrong_arguments_of_comparisons_are_one_line(tmp_path, words, fragments):
     processes.refuse("uwbsim", *words, cwd=tmp_path, naming=fragments)
     assert not list(tmp_path.iterdir())

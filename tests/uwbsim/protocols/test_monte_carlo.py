@@ -204,7 +204,7 @@ def test_results_print_themselves():
         ),
     ],
 )
-def test_arguments_that_cannot_be(call, message):
+def test_wrong_arguments_are_refused(call, message):
     with pytest.raises(uwbsim.ParameterError, match=one_line(message)) as caught:
         call()
     assert "--" not in str(caught.value)

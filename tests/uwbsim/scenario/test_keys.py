@@ -136,7 +136,7 @@ def changed(tmp_path, old, new):
         ("speed_mps = 0.8\nacceleration", "times_s = [1, 2]\nspeed_mps = 0.8\nacceleration", ["times_s", "either"]),
     ],
 )
-def test_worlds_that_cannot_be(tmp_path, old, new, fragments):
+def test_wrong_worlds_are_refused(tmp_path, old, new, fragments):
     with pytest.raises(uwbsim.ScenarioError, match=one_line(*fragments)):
         uwbsim.simulate(uwbsim.load(changed(tmp_path, old, new)))
 
@@ -191,7 +191,7 @@ def planned(tmp_path, slots):
         ("9,1,3\n7,3,1\n", r"first slot is at 7 s, after the end of the run \(run.duration_s = 6\)"),
     ],
 )
-def test_a_plan_file_that_cannot_be_is_refused(tmp_path, slots, message):
+def test_wrong_plan_files_of_scenarios_are_refused(tmp_path, slots, message):
     with pytest.raises(uwbsim.ScenarioError, match=message):
         uwbsim.load(planned(tmp_path, slots), ["run.duration_s=6"])
 
@@ -260,14 +260,14 @@ def test_listed_success_counts_failures(tmp_path):
 # Scenarios of the package by name: found, listed, copied.
 
 
-def test_every_one_is_told_of():
+def test_every_scenario_has_a_description():
     told = listed()
     assert list(told) == list(shipped_scenarios()) == sorted(told)
     assert all(4 < len(text) < 200 for text in told.values())
     assert len(set(told.values())) == len(told), "two are told of alike"
 
 
-def test_a_name_does_for_a_file_where_there_is_none(tmp_path, monkeypatch):
+def test_names_of_scenarios_replace_missing_files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert uwbsim.load("nlos_office/office") == uwbsim.load(shipped_scenarios()["nlos_office/office"])
     assert uwbsim.load("noiseless.toml") == uwbsim.load("noiseless")

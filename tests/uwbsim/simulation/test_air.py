@@ -97,7 +97,7 @@ TWO = [[slot(0, 0, 0, 1)], [slot(1, 50, 2, 3)]]
         pytest.param(TWO, with_powers(([0, 1], [1, 0], -97.0), everywhere=-100.01), ["", None], id="below it"),
     ],
 )
-def test_what_becomes_of_exchanges_that_meet(hosts, powers, reasons):
+def test_colliding_exchanges_end_as_planned(hosts, powers, reasons):
     outcome = played(hosts, powers)
     named = [found if reason is not None else None for found, reason in zip(outcome.reason, reasons, strict=True)]
     assert named == reasons
@@ -241,7 +241,7 @@ def test_a_single_sided_exchange_has_no_third_reception():
     assert (heard["rx3"].any(), np.isnan(heard["fpp3_dbm"]).all()) == (False, True)
 
 
-def test_who_is_too_far_hears_nothing_and_listening_changes_nothing_else():
+def test_far_listeners_receive_nothing_and_listening_has_no_effect():
     near, both = flight(), flight(passive=(3, 4), sensitivity_dbm=-105.0)
     assert len(flight(passive=(4,), sensitivity_dbm=-92.0).overheard["rx1"]) == 0
     np.testing.assert_array_equal(near.exchanges.rx2, both.exchanges.rx2)

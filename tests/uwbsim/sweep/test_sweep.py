@@ -83,7 +83,7 @@ def test_results_are_rows_with_settings_versions_and_outcomes(alone):
     assert loud > quiet
 
 
-def test_what_fails_is_a_row_and_the_rest_goes_on(tmp_path):
+def test_failed_runs_are_rows_and_others_continue(tmp_path):
     text = HEAD + 'ranges = 100\n[vary]\n"ranging.rate_hz" = [50.0, 99999.0]\n'
     summary = run_sweep(plan(tmp_path, text), tmp_path / "out", workers=1)
     assert (summary.done, summary.failed) == (2, 1)
@@ -223,7 +223,7 @@ def test_functions_of_a_stranger_reach_other_processes(tmp_path, stranger):
     np.testing.assert_allclose(np.subtract(before, after), 3.0, atol=0.03)
 
 
-def test_what_it_raises_fails_its_run_only(tmp_path, stranger):
+def test_errors_of_functions_fail_only_their_run(tmp_path, stranger):
     summary = run_sweep(plan(tmp_path, CALIBRATE), tmp_path / "out", workers=1, evaluate=stranger.failing)
     assert (summary.done, summary.failed) == (2, 2)
     assert {row["error"] for row in rows(tmp_path / "out")} == {"'no such figure'"}
@@ -296,6 +296,6 @@ def test_a_scheduler_that_does_not_answer_is_named(alone, tmp_path, monkeypatch)
         (HEAD + 'design = "latin-hypercube"\n[vary]\n"ranging.rate_hz" = { low = 5, high = 1 }\n', "low below high"),
     ],
 )
-def test_plans_that_cannot_be(tmp_path, text, fragment):
+def test_wrong_sweeps_are_refused(tmp_path, text, fragment):
     with pytest.raises(ScenarioError, match=one_line(fragment)):
         plan(tmp_path, text)

@@ -77,7 +77,7 @@ def test_readings_end_where_those_of_the_chip_do(compared):
     assert simulated.max() == pytest.approx(measured.max(), abs=0.5)
 
 
-def test_alike_is_said_only_where_a_difference_would_have_shown(compared):
+def test_alike_requires_a_detectable_difference(compared):
     """Carrier readings are persistent: 317 count as 50 independent ones, which do not show a difference of 0.2."""
     one = compared[1]["carrier reading at initiator"]
     assert one.measured.worth < 100
@@ -96,7 +96,7 @@ def test_robots_warm_up_and_it_is_seen(compared):
     assert np.ptp(change[~flying]) < 1.0
 
 
-def test_what_such_a_flight_cannot_tell_is_said(compared):
+def test_undetermined_properties_of_a_real_flight_are_listed(compared):
     words = " ".join(compared[0].unknown)
     assert "(life_s): a pair ranges every" in words
     assert "The difference of -0.11 ppm between dt64/dt53 and the carrier readings" in words

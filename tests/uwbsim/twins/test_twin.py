@@ -119,7 +119,7 @@ def test_a_twin_of_a_twin_is_alike(compared):
     assert compared["reply dt32"].to_dict()["probability"] > 0.01
 
 
-def test_what_persists_differently_is_not_alike(found):
+def test_different_persistence_is_not_alike(found):
     """The same values at other times: their distribution is equal, their autocorrelation is not."""
     shuffled = np.random.default_rng(4).permutation(len(found.measured))
     moved = replace(found.measured, residual_m=found.measured.residual_m[shuffled])
@@ -159,7 +159,7 @@ def test_recordings_without_a_twin(flight, what):
         uwbsim.twin(change(flight), known(world()))
 
 
-def test_a_recording_that_says_too_little_ends_with_status_1(tmp_path):
+def test_insufficient_recordings_have_status_1(tmp_path):
     uwbsim.simulate(uwbsim.load("noiseless", {"run.duration_s": 0.2})).save(tmp_path / "short.uwb")
     (tmp_path / "c.json").write_text(json.dumps(known(world())))
     words = ("uwbsim", "twin", "short.uwb", "-c", "c.json", "-o", "twin.toml")
@@ -205,7 +205,7 @@ def test_calibrations_without_a_twin_are_refused_by_place(flight, change, place)
         uwbsim.twin(flight, known(world()) | change)
 
 
-def test_nothing_is_written_where_something_is_wrong(flight, tmp_path):
+def test_twins_with_errors_write_no_files(flight, tmp_path):
     flight.save(tmp_path / "f.uwb")
     (tmp_path / "c.json").write_text("{}")
     (tmp_path / "t.html").write_text("mine")
@@ -307,7 +307,7 @@ def test_shares_are_found_of_all_and_of_pairs(made, reflected_found):
     assert np.mean(list(reflected_found.delays_ns.values())) == pytest.approx(0.0, abs=0.02)
 
 
-def test_the_life_is_that_of_the_states(made, reflected_found):
+def test_durations_are_those_of_the_states(made, reflected_found):
     """The integral of the states' autocorrelation, without a fit and without a model of random redraws."""
     whole, state, _ = made
     pairs = [state[whole.pair == k].astype(float) for k in range(6)]
@@ -349,7 +349,7 @@ def autoregressive(steps, keep):
     return values
 
 
-def test_values_are_worth_what_their_dependence_leaves():
+def test_effective_sizes_agree_with_theory():
     """An autoregressive sequence with the coefficient a has (1 - a)/(1 + a) of its length in independent values."""
     value, group = autoregressive(np.random.default_rng(3).normal(size=60_000), [0.8] * 60_000), np.zeros(60_000, int)
     assert effective_size(value, group) / 60_000 == pytest.approx(0.2 / 1.8, rel=0.1)
@@ -430,7 +430,7 @@ def test_readings_that_saturate_are_told_from_powers_that_end():
     assert saturated.found["path_loss_exponent"] == pytest.approx(2.4, abs=0.2)
 
 
-def test_a_mast_stands_and_robots_fly_as_recorded(other_found):
+def test_masts_are_static_and_robots_fly_as_recorded(other_found):
     motions = {body.name: body.motion for body in other_found.scenario.bodies}
     assert [motion.model for motion in motions.values()] == ["recorded", "recorded", "static"]
     assert motions["mast"].position_m == pytest.approx((-1.5, 3.0, 2.5))

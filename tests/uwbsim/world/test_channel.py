@@ -141,7 +141,7 @@ def test_tags_may_send_stronger_and_read_too_high():
     assert (report.fpp1_dbm, report.fpp2_dbm) == pytest.approx((x.fpp1_dbm[0], x.fpp2_dbm[0]), abs=2e-4)
 
 
-def test_who_sends_weakly_is_not_heard():
+def test_weak_transmitters_are_not_received():
     radio = {"sensitivity_dbm": -85.0, "power_noise_db": 0.0}
     weak = {"tx_power_db": -10.0}
     for place, tags in enumerate([(weak, {}), ({}, weak)]):
@@ -271,7 +271,7 @@ def test_a_direct_path_counts_down_to_the_threshold_and_no_further(below_db, fir
     assert found.total_dbm[0] == pytest.approx(-80.0 + 10 * np.log10(1 + 10 ** (-below_db / 10)), abs=0.05)
 
 
-def test_what_is_below_sensitivity_is_no_first_path():
+def test_paths_below_sensitivity_are_no_first_paths():
     weak = arrivals((0.0, -106.0, 0.0), (2.0, -98.0, 0.0))
     assert detect(weak, *SENSING).excess_m[0] == pytest.approx(2.0, abs=0.005)
     keener = Radio(dynamic_range_db=15.0, sensitivity_dbm=-108.0)
@@ -455,6 +455,6 @@ def test_a_longer_run_continues_the_same_reflections():
         ({"life_s": 0.0}, "life_s"),
     ],
 )
-def test_models_that_cannot_be_are_refused(change, fragment):
+def test_wrong_models_are_refused(change, fragment):
     with pytest.raises(uwbsim.ScenarioError, match=fragment):
         states_world(**change)

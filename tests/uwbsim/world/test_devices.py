@@ -155,7 +155,7 @@ def test_group_delay_from_a_table_file_for_all(tmp_path, monkeypatch):
     assert found[0] - found[1] == pytest.approx(0.01, abs=0.001)
 
 
-def test_the_carrier_has_a_sign_and_a_bias_that_grows_with_power():
+def test_carrier_readings_have_a_sign_and_a_bias_by_power():
     told = []
     for radio in ({}, {"carrier_sign": -1}, {"skew_bias_ppm": 0.1, "skew_bias_ppm_per_db": 0.02}):
         exact = {"quantize": False, "first_path_at_1m_dbm": -80.0}
@@ -331,7 +331,7 @@ def test_a_body_in_the_way_weakens_served_boards_by_its_chord():
         ("", lambda link, _: link, "`name`: found '', expected a word"),
     ],
 )
-def test_effects_that_cannot_be_are_refused(name, effect, fragment):
+def test_wrong_effects_are_refused(name, effect, fragment):
     with pytest.raises(uwbsim.ParameterError, match=fragment):
         uwbsim.register_channel_effect(name, effect)
     assert "x" not in CHANNEL_EFFECTS
