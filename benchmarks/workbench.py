@@ -169,6 +169,7 @@ def dask() -> str:
     """Return the relative overhead of Dask for a chunk of one second, measured on chunks alone."""
     from distributed import Client, LocalCluster
 
+    from uwblink.protocols.table import PROTOCOLS
     from uwbsim.sweep.design import load_design
     from uwbsim.sweep.executors import Work, run_chunk
 
@@ -176,7 +177,8 @@ def dask() -> str:
         path = Path(folder) / "plan.toml"
         path.write_text(SWEEP.format(scenario="icra2023/test1", seeds=40))
         plan = load_design(path)
-        work = Work.of_here(plan.scenario.stem, plan.protocols, plan.settings.ranges)
+        rows = tuple(PROTOCOLS[name] for name in plan.protocols)
+        work = Work(name=plan.scenario.stem, protocols=rows, ranges=plan.settings.ranges)
         _, once = run_chunk([plan.loaded(0)], work)
         _, once = run_chunk([plan.loaded(1)], work)
         size = max(int(1 / once), 1)

@@ -300,7 +300,7 @@ def _elevations(calibration: Calibration, ranges: Ranges | None) -> list[float]:
     tags = [tag for one in calibration.patterns for tag in one.tags]
     z = np.zeros(1)
     if ranges is not None:
-        seen = np.isin(np.stack([ranges.initiator, ranges.target], axis=1), tags)
+        seen = np.isin(ranges.ends, tags)
         z = ranges.toward[seen].astype(np.float64)[:, 2]
     low, middle, high = np.arcsin(np.nanquantile(z, (0.1, 0.5, 0.9)) if np.isfinite(z).any() else np.zeros(3)).tolist()
     return [middle, low, high] if high - low > np.radians(30) else [middle]

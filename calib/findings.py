@@ -9,7 +9,7 @@ recording is long. Other conditions can only suppress a finding, so p-values sta
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Final
@@ -44,31 +44,112 @@ CERTAIN: Final = "none: no chance is involved"
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A fault: its name, the evidence, the remedy, and the probability that sound data show as much evidence.
+    """A fault or a limit: its name, the evidence, the remedy, and the probability that sound data show as much.
 
-    `p_value` is 0 if no chance is involved, for example if numbers contradict each other.
+    `p_value` is 0 if no chance is involved, for example if numbers contradict each other, and None if nothing was
+    tested, as for a limit of the data.
     """
 
     fault: str
     evidence: str
     remedy: str
-    p_value: float
+    p_value: float | None
 
     def __str__(self) -> str:
         """Return the evidence and the remedy."""
-        return f"{self.evidence}; {self.remedy}"
+        return f"{self.evidence}; {self.remedy}" if self.remedy else self.evidence
+
+
+REMEDIES: Final = {
+    # Unknowns that the data do not determine.
+    "undetermined delays": "ranges among three of these tags, or a known delay (`fixed_ns`), would determine the rest",
+    "undetermined pattern over direction": "record a flight in which the robot makes a full turn at several places",
+    "undetermined slope over temperature": "record while the boards warm up",
+    "pattern or effect of power": "compare with a fit with `pattern` none and `groups` of tags",
+    "pattern of another tag": "fit all recordings together to estimate it",
+    "constants of pairs": "record three or more tags that all range with each other for delays",
+    "given delays": "fit without `delays_from` to estimate them",
+    "no curve": "record with powers, at several distances and attitudes, to fit a curve",
+    "constant power": "record at several distances and attitudes to fit a curve",
+    "reference power": "compare the delays only with those at the same power",
+    "too few pairs": "record more tags, or anchors",
+    "power confounded with distance": "turn the antennas while recording, or fit with `delays_only`",
+    # Faults of tags, pairs and true distances.
+    "offset of a pair": "record this pair again",
+    "delay changed for a time": "check whether the antenna was touched",
+    "delay changed between recordings": "check whether an antenna was changed, or something moved, in between, and fit "
+    "the recordings separately",
+    "errors of one tag over power": "check its antenna and the objects near it",
+    "power readings of a tag": "check its gain and its antenna",
+    "power levels of tags": "compare its delay only with delays at the same powers",
+    "noisy powers": "turn the antennas while recording",
+    "clock skew": "import with protocol ss-cfo, or change the sign of the carrier readings",
+    "clocks contradict the carriers": "check the firmware's third messages, or import with protocol ss-cfo",
+    "two antenna delays of a tag": "program also the firmware's constants (`calib export --to firmware`), and record "
+    "again",
+    "positions of listeners": "check the positions of the listeners, or fit with `use` exchanges",
+    "positions of a target and a listener": "check the positions of both tags",
+    "unused differences of arrival": "fit with `use` receptions",
+    "scale of true distances": "check scale, unit and lever arms of the true distances",
+    "time offset of true distances": "check the clocks (`calib doctor` states the difference)",
+    "errors of places": "check the lever arms, then record also at other places, or farther from walls: a common error "
+    "of all ranges cannot be detected",
+    "reflections of a pair": "record it again, the delays depend on the other pairs",
+    "reflections of a tag": "check for objects near its antenna",
+    "supply voltage": "keep the supply constant while boards warm up",
+    "wrong known distance": "measure it again, antenna to antenna, or leave it out",
+    "motion faster than the trajectory": "fly more slowly",
+    "unused known distance": "give an arrangement or its seconds",
+    "second solution": "use anchors that are not in one plane, attitudes, heights, or a known start",
+    # Surveys.
+    "arrangement not as it is said to be": "move the boards onto the line or plane, or survey without `known`",
+    "board moved within an arrangement": "record that arrangement again, or end it before",
+    "exchanged labels": "check the labels of these boards",
+    "few ranges of a pair": "record for longer",
+    "powers outside those of the curve": "use the curve of a calibration at such powers",
+    "common part of delays": "state a measured distance (`known`)",
+    "two solutions of a survey": "add an arrangement or a known distance",
+    # What is doubtful about the data as a whole.
+    "few independent stretches": "record for longer",
+    "short recording": "record for longer",
+    "ranges without stamps": "record the stamps, if the device states them",
+    "implausible delay": "check the unit of true distances, the order of stamps, the sign of carrier readings and the "
+    "configured antenna delays",
+    "large errors": "check the true distances",
+    "ranges outside three sigmas": "run `calib doctor`",
+    "exchanges left out": "run `calib doctor`",
+    "another loss": "compare with other losses",
+    "not converged": "check the data with `calib doctor`, or try another loss",
+}
+"""What to do about each fault and limit of a fit or a survey."""
+
+
+def either(findings: Sequence[Finding]) -> Finding:
+    """Return one finding for causes that have the same effect, with the names of all."""
+    return Finding(
+        " or ".join(one.fault for one in findings),
+        "; or ".join(one.evidence for one in findings),
+        "; ".join(filter(None, (one.remedy for one in findings))),
+        findings[0].p_value,
+    )
+
+
+def warning(fault: str, evidence: str, p_value: float | None = None) -> Finding:
+    """Return the finding of a fault or limit among `REMEDIES`."""
+    return Finding(fault, evidence, REMEDIES[fault], p_value)
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
     """A possible finding of a check: the fault, its evidence, its p-value, and words that complete the remedy.
 
-    `gain` is the reduction of the recording's errors if the fault is undone; 0 for checks that do not undo it.
+    A check that involves no chance states no p-value. `gain` is the reduction of the recording's errors if the fault is
+    undone; 0 for checks that do not undo it.
     """
 
     fault: str
     evidence: str
-    p_value: float = 0.0
+    p_value: float = 1.0
     words: Mapping[str, Any] = field(default_factory=dict)
     gain: float = 0.0
 
@@ -94,12 +175,33 @@ class Check:
         return self.sound == CERTAIN
 
     def findings(self, candidates: Iterable[Candidate], level: float) -> list[Finding]:
-        """Return the candidates whose p-value is below a level as findings."""
+        """Return the candidates whose p-value is below a level as findings; all of them if no chance is involved."""
         return [
-            Finding(one.fault, one.evidence, self.remedies[one.fault].format(**one.words), one.p_value)
+            Finding(one.fault, one.evidence, self.remedies[one.fault].format(**one.words), p_value)
             for one in candidates
-            if one.p_value < level
+            if (p_value := 0.0 if self.certain else one.p_value) < level
         ]
+
+
+def for_provenance(findings: Iterable[Finding]) -> dict[str, Any]:
+    """Return findings as a calibration states them: sentences, and the fault and the p-value of each in their order."""
+    several = list(findings)
+    return {
+        "warnings": [str(one) for one in several],
+        "findings": [{"fault": one.fault, "p_value": one.p_value} for one in several],
+    }
+
+
+def contradictions_in(provenance: Mapping[str, Any]) -> list[str]:
+    """Return the sentences of the findings in a calibration that have a p-value, so that they are no mere limits.
+
+    Calibrations from before 0.3 have the sentences themselves as findings.
+    """
+    found = list(provenance.get("findings", []))
+    if all(isinstance(one, str) for one in found):
+        return found
+    texts = map(str, provenance.get("warnings", []))
+    return [text for text, one in zip(texts, found, strict=False) if one.get("p_value") is not None]
 
 
 def exceeds(value: float, std: float, dof: float, *, tolerance: float = 0.0, tried: float = 1) -> float:

@@ -344,7 +344,7 @@ class RangeUpdate:
 
 def ends_of(ranges: Ranges) -> Ints:
     """Return the tags (n, 2) whose delays ranges contain: rows of the ranges, then rows of their arrivals."""
-    ends, heard = np.column_stack([ranges.initiator, ranges.target]), ranges.arrivals
+    ends, heard = ranges.ends, ranges.arrivals
     return ends if heard is None else np.concatenate([ends, ends[heard.exchange]])
 
 

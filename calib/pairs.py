@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,10 @@ class Pairs:
     def names(self) -> tuple[str, ...]:
         """The names of the pairs, such as 1-2."""
         return tuple(f"{a}-{b}" for a, b in self.ends.tolist())
+
+    def among(self, tags: Sequence[int]) -> Ints:
+        """Return the indices (n, 2) of both tags of each range among `tags` in order, the lower tag's first."""
+        return np.searchsorted(tags, self.ends)[self.number]
 
 
 def pairs_of(initiator: Ints, target: Ints) -> Pairs:

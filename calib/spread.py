@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from scipy import ndimage, stats
+from scipy import ndimage, special
 
 from uwblink.arrays import Floats, Ints
 
@@ -18,6 +18,7 @@ __all__ = [
     "radius_95",
     "robust_spread",
     "spreads",
+    "students_factor",
 ]
 
 TWO_SIDED_95: Final = 1.959963984540054
@@ -37,7 +38,12 @@ def radius_95(covariance: Floats) -> float:
     exact for equal variances, also if some of them are zero.
     """
     mean, square = float(np.trace(covariance)), float(np.sum(np.square(covariance)))
-    return float(np.sqrt(stats.chi2.ppf(0.95, mean**2 / square) * square / mean)) if mean > 0 else 0.0
+    return float(np.sqrt(special.chdtri(mean**2 / square, 0.05) * square / mean)) if mean > 0 else 0.0
+
+
+def students_factor(freedom: float) -> float:
+    """Return the ratio of the 95 % intervals of Student's t with so many degrees of freedom and of a normal value."""
+    return float(special.stdtrit(freedom, 0.975)) / TWO_SIDED_95
 
 
 def robust_spread(values: Floats, centre: float | None = None) -> float:

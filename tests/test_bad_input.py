@@ -6,22 +6,26 @@
 import gzip
 import json
 import os
+import pty
 from dataclasses import replace
+from pathlib import Path
 
 import duckdb
 import numpy as np
 import pytest
 
 import calib
+import uwblink
 import uwbsim
 from calib.errors import BadInputError
-from tests.boards import served
+from tests.boards import bench_scenario, record_bench, served
 from tests.processes import refuse, run, succeed
 from tests.shared_data import ROOT
 from uwblink import Contents, Exchanges, Poses
 from uwblink.boards.ports import Terminal
 from uwblink.errors import ImportTableError, PortError
 from uwblink.importers.guess import guess_map
+from uwbsim.boards.server import Server
 
 NOISELESS = (ROOT / "scenarios" / "noiseless.toml").read_text()
 BENCH = ROOT / "scenarios" / "two_boards_on_a_bench" / "bench.toml"
@@ -310,6 +314,53 @@ def test_a_second_server_does_not_take_the_links_of_the_first(tmp_path):
     first.unplug()
     (tmp_path / "tag1").symlink_to(tmp_path / "gone")
     Terminal(tmp_path / "tag1").unplug()
+
+
+@pytest.fixture
+def numbered(tmp_path, monkeypatch):
+    """Pseudo-terminals with the names pts0, pts1 ..., as the system gives the smallest names that are free."""
+    real, devices = pty.openpty, {}
+
+    def openpty():
+        ends = real()
+        devices[ends[1]] = str(tmp_path / f"pts{len(devices)}")
+        Path(devices[ends[1]]).touch()
+        return ends
+
+    monkeypatch.setattr(pty, "openpty", openpty)
+    monkeypatch.setattr(os, "ttyname", devices.__getitem__)
+
+
+@pytest.mark.parametrize("names", [(0, 1, 2), (1, 2, 0), (2, 1, 0)])
+def test_a_server_takes_over_the_links_of_a_killed_one(tmp_path, numbered, names):
+    """The links lead to terminals that the new server opens again, also for another board."""
+    for tag, name in enumerate(names, 1):
+        (tmp_path / f"tag{tag}").symlink_to(tmp_path / f"pts{name}")
+    server = Server(bench_scenario(), tmp_path)
+    assert [(tmp_path / f"tag{tag}").readlink().name for tag in (1, 2, 3)] == ["pts0", "pts1", "pts2"]
+    server.close()
+    assert not [*tmp_path.glob("tag*")]
+
+
+def test_terminals_of_which_one_cannot_have_its_link_leave_no_other_link(tmp_path):
+    record_bench(tmp_path / "r.uwb", duration_s=0.5)
+    (tmp_path / "tag2").write_text("mine")
+    with uwblink.Recording.open(tmp_path / "r.uwb") as recording, pytest.raises(PortError, match="tag2"):
+        uwblink.boards.play(recording, lambda names: None, link_dir=tmp_path)
+    with pytest.raises(PortError, match="tag2"):
+        Server(bench_scenario(), tmp_path)
+    assert [(path.name, path.read_text()) for path in tmp_path.glob("tag*")] == [("tag2", "mine")]
+
+
+def test_served_poses_do_not_replace_an_input(tmp_path):
+    for given in ("scenario", "faults"):
+        (tmp_path / "scenario").write_text(BENCH.read_text())
+        (tmp_path / "faults").write_text("")
+        words = (tmp_path / "scenario", "--faults", tmp_path / "faults", "--duration", 0.1)
+        refuse(
+            "uwbsim", "serve", *words, "--poses", tmp_path / given, "--force", naming=["--poses", "is also an input"]
+        )
+        assert (tmp_path / "scenario").read_text() == BENCH.read_text()
 
 
 def test_the_command_printed_by_a_server_records_and_replay_repeats_it(tmp_path, ports):

@@ -24,6 +24,7 @@ BESIDE = {
     "uwblink.cli.start": "Ctrl-C while a command is being imported, and what must come before",
     "uwblink.settings": "fields of settings that Python and the command line share",
     "calib.settings": "the settings of a fit, of which its options are made",
+    "uwbsim.settings": "the settings of a prediction, of which its options are made",
     "uwblink.exporters.EXPORTERS": "names of the forms that a recording can leave in, for a shell to complete",
     "uwblink.cli.shared": "options, examples, completion, errors, interrupts and progress, alike in the three commands",
 }

@@ -79,6 +79,12 @@ class Registry(Mapping[str, Row], Generic[Row]):
             )
         self._rows[row.name] = row
 
+    def adopt(self, rows: Iterable[Row]) -> None:
+        """Add the rows of another process that are not known here."""
+        for row in rows:
+            if row.name not in self:
+                self.register(row)
+
     def remove(self, name: str) -> None:
         """Remove a row that was added; raises `ArgumentError` for other names."""
         if name in self._own or name not in self._rows:
@@ -88,6 +94,11 @@ class Registry(Mapping[str, Row], Generic[Row]):
     def known(self) -> list[Row]:
         """Return the loaded rows, without loading entry points."""
         return list(self._rows.values())
+
+    def added(self) -> list[Row]:
+        """Return the rows that are not the project's own."""
+        self._load()
+        return [row for name, row in self._rows.items() if name not in self._own]
 
     @contextmanager
     def calling(self, name: str, error: type[Exception]) -> Iterator[None]:

@@ -19,12 +19,12 @@ if TYPE_CHECKING:  # so that mypy follows other imports first
     from uwbsim.protocols.comparison import optimum as optimum
     from uwbsim.protocols.prediction import FleetFigures as FleetFigures
     from uwbsim.protocols.prediction import Prediction as Prediction
-    from uwbsim.protocols.prediction import State as State
     from uwbsim.protocols.prediction import predict_fleet as predict_fleet
     from uwbsim.protocols.prediction import predict_state as predict_state
     from uwbsim.scenario.loading import load as load
     from uwbsim.scenario.loading import shipped_scenarios as shipped_scenarios
     from uwbsim.scenario.model import Scenario as Scenario
+    from uwbsim.settings import State as State
     from uwbsim.simulation.run import Simulated as Simulated
     from uwbsim.simulation.run import preview as preview
     from uwbsim.simulation.run import simulate as simulate

@@ -14,7 +14,6 @@ from calib.calibration.power_curves import ends, lift
 from calib.data.arrivals import Arrivals
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, LeftOutWarning
-from calib.pairs import pairs_of
 from uwblink.arrays import Bools, ColumnTable, Floats
 from uwblink.display import as_text, excerpt, first_few
 from uwblink.errors import warn
@@ -231,7 +230,7 @@ def determined(calibration: Calibration, ranges: Ranges) -> Bools:
 
     The sum of both delays must be determined; for differences of arrival without stamps, their difference.
     """
-    sides, pairs = calibration.sides, pairs_of(ranges.initiator, ranges.target)
+    sides, pairs = calibration.sides, ranges.pairs
     first, second = (
         np.array([[sides.get(tag, 0) for tag in pair] for pair in pairs.ends.tolist()], int).reshape(-1, 2).T
     )
@@ -252,7 +251,7 @@ def keep_determined(calibration: Calibration, ranges: Ranges) -> Ranges:
 
 def undetermined_text(calibration: Calibration, ranges: Ranges, good: Bools) -> str:
     """Return a sentence that names the pairs of the ranges that are not in the mask `good` (n,), with the reason."""
-    names = first_few(pairs_of(ranges.initiator[~good], ranges.target[~good]).names)
+    names = first_few(ranges[~good].pairs.names)
     why = split_text(calibration.undetermined_splits)
     return f"{ranges.source}: the calibration cannot correct the ranges of {names}: {why}"
 
@@ -262,7 +261,7 @@ def _offsets_m(calibration: Calibration, ranges: Ranges) -> Floats:
     offsets = calibration.pair_offsets
     if not offsets:
         return np.zeros(len(ranges))
-    pairs = pairs_of(ranges.initiator, ranges.target)
+    pairs = ranges.pairs
     ends = list(map(tuple, pairs.ends.tolist()))
     missing = [pair_name(pair) for pair in ends if pair not in offsets]
     if missing:

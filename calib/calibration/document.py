@@ -273,13 +273,12 @@ def known_of_splits(splits: Iterable[Split]) -> str:
 
 
 def split_text(splits: Iterable[Split]) -> str:
-    """Return `known_of_splits` with the reason, and with measurements that would determine the rest."""
+    """Return `known_of_splits` with the reason."""
     splits = list(splits)
     why = (
-        "delays of one side can increase by the amount by which those of the other decrease; ranges among three of "
-        "these tags, or a known delay (`fixed_ns`), would determine the rest"
+        "delays of one side can increase by the amount by which those of the other decrease"
         if any(map(all, splits))
-        else "a common shift of their delays cancels in these; a known delay (`fixed_ns`) would determine the rest"
+        else "a common shift of their delays cancels in these"
     )
     return f"{known_of_splits(splits)}, because {why}"
 

@@ -362,7 +362,7 @@ def _persistence(ranges: Ranges, values: Floats, least: float = 0.0) -> tuple[fl
     The products of values are averaged in bins of the logarithm of the lag; bins with fewer than 50 are left out. a is
     at least `least`. Returns None if no bin is left.
     """
-    pairs = pairs_of(ranges.initiator, ranges.target)
+    pairs = ranges.pairs
     pair = ranges.session * np.int64(len(pairs.ends)) + pairs.number
     order = np.lexsort((ranges.time_ns, pair))
     pair, time_s, away = pair[order], ranges.time_ns[order] * 1e-9, values[order]

@@ -47,6 +47,7 @@ from calib.calibration.patterns import CheckedPattern, CheckedSlope, dependences
 from calib.calibration.power_curves import LIFTS, BiasCurve, SigmaCurve, basis, lifted_power
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
+from calib.findings import Finding
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats
 from uwblink.display import as_html, as_text, first_few
@@ -445,11 +446,16 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
 
 
 class CalibrationResult:
-    """Base of the results of a fit and of a survey: a calibration, a headline on its data, and warnings."""
+    """Base of the results of a fit and of a survey: a calibration, a headline on its data, and findings."""
 
     __slots__ = ()
     calibration: Calibration
-    warnings: Sequence[str]
+    findings: Sequence[Finding]
+
+    @property
+    def warnings(self) -> list[str]:
+        """The findings as sentences."""
+        return [str(one) for one in self.findings]
 
     def headline(self) -> str:
         """Return one line about the data of the calibration."""

@@ -150,8 +150,7 @@ def dependences_m(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Flo
 def lack_direction(calibration: Calibration, ranges: Ranges) -> Bools:
     """Return a mask (n,) of ranges in which a tag with a pattern has an unknown direction."""
     tags = [tag for one in calibration.patterns for tag in one.tags]
-    ends = np.column_stack([ranges.initiator, ranges.target])
-    return np.asarray((np.isin(ends, tags) & np.isnan(ranges.toward).any(axis=2)).any(axis=1))
+    return np.asarray((np.isin(ranges.ends, tags) & np.isnan(ranges.toward).any(axis=2)).any(axis=1))
 
 
 def warn_of_directions(lacking: int, count: int, source: str) -> None:
@@ -170,12 +169,11 @@ def warn_of_temperatures(calibration: Calibration, ranges: Ranges, beyond_k: flo
     Within 5 K a slope with an error of half of the manual's 2.15 mm/K (DW1000 user manual, section 8.3.1) changes
     ranges by 5 mm, less than their repeatability.
     """
-    ends = np.column_stack([ranges.initiator, ranges.target])
     for low, high in sorted({one.span_c for one in calibration.temperatures}):
         with np.errstate(invalid="ignore"):
             outside = (ranges.temperature_c < low - beyond_k) | (ranges.temperature_c > high + beyond_k)
         fitted = {tag for one in calibration.temperatures if one.span_c == (low, high) for tag in one.tags}
-        if tags := sorted(fitted & {*ends[outside].tolist()}):
+        if tags := sorted(fitted & {*ranges.ends[outside].tolist()}):
             named = first_few(map(str, tags))
             text = f"tags {named} were used more than {beyond_k:.0f} K outside the {low:.0f} to {high:.0f} °C at which"
             warn(f"{text} the calibration was fitted; the correction is extrapolated", TemperatureWarning)

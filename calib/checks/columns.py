@@ -16,7 +16,6 @@ from calib.data.ranges import Ranges
 from calib.errors import BadInputError
 from calib.estimator.identifiability import free_directions
 from calib.findings import Candidate, exceeds, more_often
-from calib.pairs import pairs_of
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats
 from uwblink.protocols.table import PROTOCOLS, single_sided
@@ -97,7 +96,7 @@ def impossible(view: RecordingView) -> Bools:
         # Where reported ranges are in another unit by more, none of them contradicts its stamps.
         if not len(ratios) or abs(np.median(ratios) - 1) <= 1e-4:
             bad |= np.abs(board_range(e) - e.range_m) > 0.01
-        away = np.abs(view.error_m) > 50.0
+        away = np.abs(view.ranges.error_m) > 50.0
     # Where most are far off, something else is wrong with all of them.
     return np.asarray(bad | away if np.mean(away) < 0.5 else bad)
 
@@ -374,7 +373,7 @@ def confounded(view: RecordingView) -> Iterator[Candidate]:
     rows = np.flatnonzero(np.isfinite(lifted) & (view.ranges.truth_m > 0))
     if len(rows) < 300 or np.ptp(view.ranges.truth_m[rows]) < 0.5:
         return
-    pairs = pairs_of(view.exchanges.initiator, view.exchanges.target).number
+    pairs = view.ranges.pairs.number
     rows = rows[np.lexsort((view.exchanges.time_ns[rows], pairs[rows]))]
     pair, time_ns, shares, groups = pairs[rows], view.exchanges.time_ns[rows], [0.0], 40
     alone = len(np.unique(np.column_stack([pair, time_ns // 2_000_000_000]), axis=0))

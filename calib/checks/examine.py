@@ -15,14 +15,14 @@ from threadpoolctl import threadpool_limits
 
 from calib.checks import columns, geometry, residuals
 from calib.checks.recording_view import RecordingView, view_of
-from calib.data.sources import Data, each, opened
+from calib.data.sources import Data, each, fingerprint_of, opened, refuse_repeated
 from calib.errors import UnanswerableError
-from calib.findings import BUDGET, CERTAIN, OF_A_FIT, Candidate, Check, Finding
+from calib.findings import BUDGET, CERTAIN, OF_A_FIT, REMEDIES, Candidate, Check, Finding
 from calib.surveys.knowledge import Knowledge
 from calib.surveys.network import NARROWEST_DB, in_dbm
 from calib.surveys.recordings import read_surveys
 from calib.surveys.result import SurveyResult
-from calib.surveys.survey import survey
+from calib.surveys.survey import HYPOTHESES, survey
 
 
 def surveyed(recordings: list[Data]) -> Iterator[Candidate]:
@@ -380,10 +380,7 @@ CHECKS: Final = (
         "Does a survey of boards that stand still contradict the known facts?",
         "contradictions that the survey found by its own tests", CERTAIN,
         {
-            "board moved within an arrangement": "record this arrangement again, or end it before the movement",
-            "arrangement not as it is said to be": "move the boards onto the line or plane, or record without `known`",
-            "wrong known distance": "measure it again, antenna to antenna, or leave it out",
-            "exchanged labels": "check the labels of these two boards",
+            **{fault: REMEDIES[fault] for fault in ("board moved within an arrangement", *HYPOTHESES)},
             "survey determines nothing": "record the arrangements that calib plan survey proposes",
             "delays that a survey leaves open": "record another arrangement, or measure a distance: calib plan "
             "survey proposes which",
@@ -428,16 +425,19 @@ def examine(data: Data | Iterable[Data]) -> list[Finding]:
     of those, which are then also compared with each other; `Ranges` are not enough. Recordings of arrangements without
     poses are surveyed together. Impossible rows are left out before the other checks, and consequences of a more
     serious fault are not reported. Of a longer recording about 160,000 exchanges are examined, in 40 stretches over all
-    of its time. Raises the errors of `Recording.open`.
+    of its time. Raises the errors of `Recording.open`, and `BadInputError` if two recordings hold the same exchanges.
 
     >>> import calib
     >>> [finding.fault for finding in calib.examine(calib.sample_flight())]
     []
     """
     recordings, views, findings = each(data), list[RecordingView](), list[Finding]()
+    contents = list[tuple[str, str]]()
     for one in recordings:
         with opened(one) as (name, source):
             whole = view_of(name, source)
+        contents += [(name, fingerprint_of(whole.exchanges))] if len(whole.exchanges) else []
+        refuse_repeated(contents)
         found, view = _examine_recording(whole)
         prefix = f"{name}: " if len(recordings) > 1 else ""
         findings += [replace(finding, evidence=prefix + finding.evidence) for finding in found]

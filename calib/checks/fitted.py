@@ -24,7 +24,7 @@ from calib.estimator.range_rows import Mixture
 from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, search, widening
 from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
-from calib.findings import NAMED_DETOUR_M, OF_A_FIT, SMALLEST_NS
+from calib.findings import NAMED_DETOUR_M, OF_A_FIT, SMALLEST_NS, Finding, either, warning
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -49,10 +49,10 @@ UNIT = np.ones((1, 1))
 """The derivative of a range by its own offset."""
 
 
-def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
+def examine_fit(found: KnownDistances) -> tuple[Floats, list[Finding]]:
     """Test a fit against alternatives with one more unknown each.
 
-    Returns the covariance (tags, tags) of the delays in ns^2, which includes the effect of misfits, and sentences about
+    Returns the covariance (tags, tags) of the delays in ns^2, which includes the effect of misfits, and findings about
     them.
     """
     slopes, louder, alone = found.slopes, change_per_decibel(found), len(found.searches) > 1
@@ -70,21 +70,21 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[str]]:
     for one in tested:
         if one.family.kind in ("pair", "session") and not len(one.family.fitted):
             plain = plain + widening(one)
-    places_ns2, of_places = np.zeros_like(plain), list[str]()
+    places_ns2, of_places = np.zeros_like(plain), list[Finding]()
     if not alone and found.model.curve is not None:
         pairs = next(one for one in tested if one.family.kind == "pair")
         places_ns2, of_places = place_covariance(found, slopes, pairs, plain)
-    covariance, sentences = _covariance_and_sentences(plain, findings, places_ns2, of_places)
+    covariance, named = _covariance_and_findings(plain, findings, places_ns2, of_places)
     # Few pairs determine the size of their offsets poorly. Variance that findings added already is not added again.
     optimum = found.searches[0].optimum
     few_ns2 = of_few_draws(optimum, optimum.layout.indices(["delay"]))
     covariance = covariance + positive_part(few_ns2 - (covariance - found.covariances["delay"]))
     return covariance, [
-        *sentences,
-        *_reflection_warnings(found),
-        *_persistence_warning(found),
-        *_redundancy_warning(found.model),
-        *_confounding_warning(found, slopes),
+        *named,
+        *_reflections(found),
+        *_persistence(found),
+        *_redundancy(found.model),
+        *_confounding(found, slopes),
     ]
 
 
@@ -99,7 +99,7 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
     """
     model, ranges, count = found.model, found.model.ranges, len(found.model.ranges)
     tags = [f"tag {tag}" for tag in model.tags]
-    ends = np.searchsorted(model.tags, model.pairs.ends)[model.pairs.number]
+    ends = model.pairs.among(model.tags)
 
     def of_tags(kind: str, derivative: Floats) -> Family:
         return Family(kind=kind, names=tags, derivative=Derivative(ends, derivative, len(tags)))
@@ -234,12 +234,13 @@ def _without_explained(findings: list[FoundOffset]) -> list[FoundOffset]:
     ]
 
 
-def _covariance_and_sentences(
-    plain: Floats, findings: list[FoundOffset], places_ns2: Floats, of_places: list[str]
-) -> tuple[Floats, list[str]]:
-    """Return the delays' covariance (tags, tags) including findings, and sentences about findings that matter.
+def _covariance_and_findings(
+    plain: Floats, findings: list[FoundOffset], places_ns2: Floats, of_places: list[Finding]
+) -> tuple[Floats, list[Finding]]:
+    """Return the delays' covariance (tags, tags) including offsets that were found, and findings about those that
+    matter.
 
-    `of_places` is a sentence on errors of places, if they are certain; `places_ns2` (tags, tags) is their covariance.
+    `of_places` is the finding on errors of places, if they are certain; `places_ns2` (tags, tags) is their covariance.
     """
     if of_places:
         # Offsets of pairs are then random like the others; a single one is not a separate fault.
@@ -259,13 +260,9 @@ def _covariance_and_sentences(
         if one.kind != "readings" and (cause or (moved > MATTERS and large)):
             # A tag that was moved is significant in more than one span of time: it is named once.
             matter.setdefault((one.kind, one.names), one)
-    noise = ""
-    if any(one.kind == "readings" for one in findings):
-        noise = "; or the powers are noisy, which has the same effect: turn the antennas while recording"
-    return covariance, [
-        *(sentence + noise for sentence in places),
-        *(sentence_of(one) + noise * (one.kind == "shared") for one in matter.values()),
-    ]
+    named = [*places, *map(finding_of, matter.values())]
+    noisy = any(one.kind == "readings" for one in findings)
+    return covariance, [_or_noise(one) if noisy and _like_noise(one) else one for one in named]
 
 
 def _largest_shift(finding: FoundOffset, covariance: Floats) -> float:
@@ -281,48 +278,81 @@ def _largest_shift(finding: FoundOffset, covariance: Floats) -> float:
     return float(np.max(np.abs(finding.effects_ns) / std, initial=0.0))
 
 
-SENTENCES = {
-    "pair": "{whose}: ranges are {size} too {way} compared with the other pairs, which changes {worst}; record this "
-    "pair again",
-    "time": "{whose}: ranges are {size} too {way} during a part of the recording, which changes {worst}; check "
-    "whether the antenna was touched",
-    "session": "{whose}: ranges in {own} are {size} {way}er than in {others} (p = {p:.1g}), which changes {worst}; "
-    "check whether an antenna was changed, or something moved, in between, and fit the recordings separately",
-    "power": "{whose}: errors change with power by {size}, unlike those of other tags, which changes {worst}",
-    "decibels": "{whose}: its powers seem to be wrong by some decibels, which changes its ranges by {size} and "
-    "{worst}; check its gain and its antenna",
-    "skew": "{whose}: ranges are {size} too {way} if it initiates, with the opposite sign if it responds, which "
-    "changes {worst}: clock skew is not corrected, or corrected with the wrong sign",
-    "heard": "{whose}: overheard frames contradict its ranges by {size}, which changes {worst}; check the positions "
-    "of the listeners, or fit with `use` exchanges",
-    "path": "{whose}: paths of overheard frames are {size} too {way}, which changes {worst}; check the positions of "
-    "both tags",
-    "scale": "ranges grow with the distance by {size} too {way} over the recorded distances, which changes {worst}; "
-    "check scale, unit and lever arms of the true distances",
-    "late": "ranges change by {size} with the speed at which true distances change (root mean square): the times of "
-    "true distances and ranges differ; check the clocks (`calib doctor` states the difference)",
+KINDS = {
+    "pair": (
+        "offset of a pair",
+        "{whose}: ranges are {size} too {way} compared with the other pairs, which changes {worst}",
+    ),
+    "time": (
+        "delay changed for a time",
+        "{whose}: ranges are {size} too {way} during a part of the recording, which changes {worst}",
+    ),
+    "session": (
+        "delay changed between recordings",
+        "{whose}: ranges in {own} are {size} {way}er than in {others} (p = {p:.1g}), which changes {worst}",
+    ),
+    "power": (
+        "errors of one tag over power",
+        "{whose}: errors change with power by {size}, unlike those of other tags, which changes {worst}",
+    ),
+    "decibels": (
+        "power readings of a tag",
+        "{whose}: its powers seem to be wrong by some decibels, which changes its ranges by {size} and {worst}",
+    ),
+    "skew": (
+        "clock skew",
+        "{whose}: ranges are {size} too {way} if it initiates, with the opposite sign if it responds, which changes "
+        "{worst}: clock skew is not corrected, or corrected with the wrong sign",
+    ),
+    "heard": (
+        "positions of listeners",
+        "{whose}: overheard frames contradict its ranges by {size}, which changes {worst}",
+    ),
+    "path": (
+        "positions of a target and a listener",
+        "{whose}: paths of overheard frames are {size} too {way}, which changes {worst}",
+    ),
+    "scale": (
+        "scale of true distances",
+        "ranges grow with the distance by {size} too {way} over the recorded distances, which changes {worst}",
+    ),
+    "late": (
+        "time offset of true distances",
+        "ranges change by {size} with the speed at which true distances change (root mean square): the times of true "
+        "distances and ranges differ",
+    ),
 }
-"""Sentences about findings, by their kinds, or by the names of errors that all ranges share."""
+"""Faults and their evidence, by the kinds of offsets, or by the names of errors that all ranges share."""
 
 
-def sentence_of(finding: FoundOffset) -> str:
-    """Return a finding as a sentence; if two causes have the same effect, both are named."""
-    own, others = finding.sessions
+def finding_of(offset: FoundOffset) -> Finding:
+    """Return an offset as a finding; if two causes have the same effect, both are named."""
+    own, others = offset.sessions
     words = {
-        "whose": " or ".join(finding.names),
-        "size": f"{100 * abs(finding.offset_m):.1f} cm",
-        "way": "long" if finding.offset_m > 0 else "short",
-        "worst": f"delays by up to {max(1e3 * finding.largest_ns, 1):.0f} ps",
-        "p": finding.p_value,
+        "whose": " or ".join(offset.names),
+        "size": f"{100 * abs(offset.offset_m):.1f} cm",
+        "way": "long" if offset.offset_m > 0 else "short",
+        "worst": f"delays by up to {max(1e3 * offset.largest_ns, 1):.0f} ps",
+        "p": offset.p_value,
         "own": own,
         "others": others,
     }
-    names = [name for name in finding.names if name in SENTENCES] if finding.kind == "shared" else [finding.kind]
-    return "; or ".join(SENTENCES[name].format(**words) for name in names)
+    names = [name for name in offset.names if name in KINDS] if offset.kind == "shared" else [offset.kind]
+    return either([warning(KINDS[name][0], KINDS[name][1].format(**words), offset.p_value) for name in names])
 
 
-def _reflection_warnings(found: KnownDistances) -> Iterator[str]:
-    """Return sentences about pairs with hardly any direct range, or otherwise about a tag with about half of its ranges
+def _like_noise(found: Finding) -> bool:
+    """Return whether noise of power readings may have the same effect: on errors of places and of true distances."""
+    return found.fault == "errors of places" or "true distances" in found.fault
+
+
+def _or_noise(found: Finding) -> Finding:
+    noise = warning("noisy powers", "the powers are noisy, which has the same effect", found.p_value)
+    return either([found, noise])
+
+
+def _reflections(found: KnownDistances) -> Iterator[Finding]:
+    """Yield findings about pairs with hardly any direct range, or otherwise about a tag with about half of its ranges
     reflected.
 
     The log odds of a pair are compared with their standard errors, including errors that last.
@@ -336,50 +366,54 @@ def _reflection_warnings(found: KnownDistances) -> Iterator[str]:
     variance = found.persistence.factor * np.einsum("pk,pk->k", which, np.asarray(optimum.covariance @ which))
     detour_m = np.exp(values["least detour"]) + np.exp(values["detour level"] + values["detour of pair"])
     share, far = expit(odds), detour_m > NAMED_DETOUR_M
-    most = len(ends) * ndtr(-odds / np.sqrt(variance)) < OF_A_FIT
+    p_values = np.minimum(len(ends) * ndtr(-odds / np.sqrt(variance)), 1.0)
+    most = p_values < OF_A_FIT
     hidden, tags = np.flatnonzero((share > HIDDEN) & far & most).tolist(), found.model.tags
     for number in hidden:
         a, b = ends[number].tolist()
         others = [tag for tag in tags if tag not in (a, b)]
         # With four tags, offsets of a pair and of the pair of the other two have the same effect.
-        either = f" or pair {others[0]}-{others[1]}" if len(tags) == 4 else ""
-        yield (
-            f"pair {a}-{b}{either}: {100 * share[number]:.0f} % of its ranges are reflected, or "
-            f"{100 * detour_m[number]:.0f} cm too long; record it again, the delays depend on the other pairs"
+        other = f" or pair {others[0]}-{others[1]}" if len(tags) == 4 else ""
+        yield warning(
+            "reflections of a pair",
+            f"pair {a}-{b}{other}: {100 * share[number]:.0f} % of its ranges are reflected, or "
+            f"{100 * detour_m[number]:.0f} cm too long",
+            float(p_values[number]),
         )
     means = {tag: float(np.where(far, share, 0.0)[np.any(ends == tag, axis=1)].mean()) for tag in tags}
     often = [tag for tag in tags if means[tag] > OFTEN and not hidden]
     for tag in often[:1]:
-        yield f"tag {tag}: {100 * means[tag]:.0f} % of its ranges are reflected; check for objects near its antenna"
+        yield warning("reflections of a tag", f"tag {tag}: {100 * means[tag]:.0f} % of its ranges are reflected")
 
 
-def _persistence_warning(found: KnownDistances) -> Iterator[str]:
-    """Return a sentence if errors last so long that there are few independent stretches of time."""
+def _persistence(found: KnownDistances) -> Iterator[Finding]:
+    """Yield a finding if errors last so long that there are few independent stretches of time."""
     lasting = found.persistence
     if lasting.stretches < FEWEST_STRETCHES:
-        yield (
+        yield warning(
+            "few independent stretches",
             f"errors last for {lasting.stretch_s:.1f} s, so the recording holds only {lasting.stretches:.0f} "
             f"independent stretches of time; intervals are widened for this, and unreliable with fewer than "
-            f"{FEWEST_STRETCHES:.0f} stretches: record for longer"
+            f"{FEWEST_STRETCHES:.0f} stretches",
         )
 
 
-def _redundancy_warning(model: RangeModel) -> Iterator[str]:
-    """Return a sentence if there are so few pairs that offsets of pairs cannot be separated from delays."""
+def _redundancy(model: RangeModel) -> Iterator[Finding]:
+    """Yield a finding if there are so few pairs that offsets of pairs cannot be separated from delays."""
     count, fitted = len(model.pairs.ends), any(unknown.kind == "offset of pair" for unknown in model.unknowns)
     if model.settings.constants == "tag" and count > 2 and not fitted:
         slopes = 0.5 * METRES_A_NS * free_ends(model.pairs, model.tags, model.settings)
         moved_ns = TYPICAL_OFFSET_M * float(np.linalg.norm(np.linalg.pinv(slopes), axis=1).max())
-        yield (
+        yield warning(
+            "too few pairs",
             f"{count} pairs are just enough to determine the delays: offsets of pairs of "
             f"{100 * TYPICAL_OFFSET_M:.1f} cm, which walls cause, would change delays by up to {1e3 * moved_ns:.0f} "
-            f"ps, "
-            "which the intervals do not include; record more tags, or anchors"
+            f"ps, which the intervals do not include",
         )
 
 
-def _confounding_warning(found: KnownDistances, slopes: Slopes) -> Iterator[str]:
-    """Return a sentence if a small error proportional to distance cannot be separated from a curve over power.
+def _confounding(found: KnownDistances, slopes: Slopes) -> Iterator[Finding]:
+    """Yield a finding if a small error proportional to distance cannot be separated from a curve over power.
 
     The curve is fitted with such an error of 1 %, which true distances may have unnoticed (a judgement). It is named if
     it adds more to the variance of the curve than all other errors.
@@ -399,8 +433,8 @@ def _confounding_warning(found: KnownDistances, slopes: Slopes) -> Iterator[str]
     more = float(np.sqrt(np.mean((rows @ taken[slopes.optimum.layout.indices(model.curve_kinds())] * slope) ** 2)))
     band = float(np.sqrt(max(np.mean(np.einsum("ij,jk,ik->i", rows, found.covariances["curve"], rows)), 0.0)))
     if more >= band:
-        yield (
+        yield warning(
+            "power confounded with distance",
             f"power and distance are confounded: an error of 1 % in true distances would change the curve by "
-            f"{1e3 * more:.0f} mm, more than its band of {1e3 * band:.0f} mm; turn the antennas while recording, or "
-            f"fit with `delays_only`"
+            f"{1e3 * more:.0f} mm, more than its band of {1e3 * band:.0f} mm",
         )

@@ -69,7 +69,7 @@ def frozen_poses(view: RecordingView) -> Iterator[Candidate]:
     repeated = (columns[1:] == columns[:-1]).all(axis=1) & (poses.body[1:] == poses.body[:-1])
     # Without repeated poses there is a gap, in which the places of antennas are not known.
     fresh = poses[~np.append(False, repeated)]
-    ends, error_m = np.stack([e.initiator, e.target], axis=1), view.less_pairs(view.error_m)
+    ends, error_m = np.stack([e.initiator, e.target], axis=1), view.less_pairs(view.ranges.error_m)
     lost = np.stack([np.isnan(antennas_m(fresh, view.tags, ids, e.time_ns)[:, 0]) for ids in ends.T], axis=1)
     lost &= np.isfinite(error_m)[:, None]
     rows = np.flatnonzero(lost.any(axis=1))
@@ -385,7 +385,7 @@ def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
     # Information of ranges on the other places, which they fit.
     tested = moved.test_constants(_decrease_by_motion(_vectors_to_bodies(changed, moved, places)))
     at_other = _by_body(_after_offsets_of_pairs(tested, len(moved.model.pairs.names)), sides)
-    before_m, after_m = (one.less_pairs(one.error_m)[fit.rows] for one in (view, changed))
+    before_m, after_m = (one.less_pairs(one.ranges.error_m)[fit.rows] for one in (view, changed))
     for body, there in away.items():
         own, mine = at_other[body], sides[body].any(axis=1)
         # The last step is from the fit whose slopes are tested.

@@ -17,8 +17,7 @@ from calib.data.clocks import as_length, corrected
 from calib.data.ranges import NO_STAMPS, STATIC, Ranges, growth_fault, look_like
 from calib.errors import UnanswerableError
 from calib.estimator.known_distances import KnownDistances
-from calib.findings import SMALLEST_NS
-from calib.pairs import pairs_of
+from calib.findings import SMALLEST_NS, Finding, warning
 from calib.spread import STD_OF_MEDIAN, TWO_SIDED_95, medians, robust_spread, spreads
 from uwblink.arrays import Floats
 from uwblink.protocols.table import is_single_sided
@@ -26,8 +25,8 @@ from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import names_in
 
-WITHOUT_CURVE: Final = "delays only"
-"""First words of warnings of fits without a curve."""
+WITHOUT_CURVE: Final = "no curve"
+"""The name of the finding of fits without a curve."""
 
 LOUD_M: Final = 0.5
 """Maximum spread of errors of UWB ranges: noise is 3 to 10 cm, and mean detours of published flights are 0.1 to 0.5 m
@@ -38,60 +37,70 @@ REGISTER_NS: Final = 65_536 * TICK_S * 1e9
 A larger delay is a length in the wrong unit: 154 m of range per tag."""
 
 
-def limit_warnings(
-    found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Mapping[int, float]
-) -> Iterator[str]:
-    """Yield sentences about undetermined values; `residuals_m` (n,) are fully corrected errors."""
+def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Mapping[int, float]) -> Iterator[Finding]:
+    """Yield findings about undetermined values; `residuals_m` (n,) are fully corrected errors."""
     model, pairs, count = found.model, found.model.settings.constants == "pair", len(found.model.pairs.ends)
     bare = int(np.count_nonzero(ranges.protocol == NO_STAMPS))
     unread = any(is_single_sided(name) and not corrected(name) for name in names_in(ranges.protocol))
-    notes = (
-        f"{'' if bare == len(ranges) else f'{bare} of {len(ranges)} '}ranges without stamps: clock skew, and "
-        f"corrections by the device itself, are unknown and contained in the {'constants' if pairs else 'delays'}; "
-        f"damaged ranges cannot be distinguished from reflected ones"
-        if bare
-        else "",
-        "single-sided ranges without reply times and carrier readings: the effect of clock skew is unknown, and "
-        "contained in the antenna delays"
-        if ranges.left_skew is None and unread
-        else str(ranges.left_skew or ""),
-        str(ranges.clocks_apart or ""),
-        f"{'the constant of one pair' if count == 1 else f'constants of {count} pairs'}: antenna delays are not "
-        f"determined, other pairs cannot be corrected, and other constant errors of a pair (an obstacle, a wrong "
-        f"lever arm) are in its constant"
-        if pairs
-        else "",
-        _without_curve(found, ranges, residuals_m) if model.curve is None else "",
-        "curve only: the delays are the given ones; a common error of the delays is in the curve, and their "
-        "individual errors stay in the ranges (medians of pairs lie within "
-        f"{as_length(float(np.ptp(medians(residuals_m, pairs_of(ranges.initiator, ranges.target).number))))})"
-        if fixed and set(model.tags) <= set(fixed)
-        else "",
-    )
-    yield from filter(None, notes)
+    if bare:
+        yield warning(
+            "ranges without stamps",
+            f"{'' if bare == len(ranges) else f'{bare} of {len(ranges)} '}ranges without stamps: clock skew, and "
+            f"corrections by the device itself, are unknown and contained in the {'constants' if pairs else 'delays'}; "
+            f"damaged ranges cannot be distinguished from reflected ones",
+        )
+    if ranges.left_skew is not None:
+        yield warning("clock skew", str(ranges.left_skew))
+    elif unread:
+        yield warning(
+            "clock skew",
+            "single-sided ranges without reply times and carrier readings: the effect of clock skew is unknown, and "
+            "contained in the antenna delays",
+        )
+    if ranges.clocks_apart is not None:
+        yield warning("clocks contradict the carriers", str(ranges.clocks_apart))
+    if pairs:
+        yield warning(
+            "constants of pairs",
+            f"{'the constant of one pair' if count == 1 else f'constants of {count} pairs'}: antenna delays are not "
+            f"determined, other pairs cannot be corrected, and other constant errors of a pair (an obstacle, a wrong "
+            f"lever arm) are in its constant",
+        )
+    if model.curve is None:
+        yield _without_curve(found, ranges, residuals_m)
+    if fixed and set(model.tags) <= set(fixed):
+        apart_m = float(np.ptp(medians(residuals_m, ranges.pairs.number)))
+        yield warning(
+            "given delays",
+            f"curve only: the delays are the given ones; a common error of the delays is in the curve, and their "
+            f"individual errors stay in the ranges (medians of pairs lie within {as_length(apart_m)})",
+        )
 
 
-def _without_curve(found: KnownDistances, ranges: Ranges, residuals_m: Floats) -> str:
+def _without_curve(found: KnownDistances, ranges: Ranges, residuals_m: Floats) -> Finding:
     if not found.model.settings.delays_only and found.model.powered.any():
-        return (
+        return warning(
+            "constant power",
             f"the first-path power never changes ({np.median(_mean_dbm(ranges)):.1f} dBm): the curve is flat, and "
-            f"the delays are valid only at this power"
+            f"the delays are valid only at this power",
         )
     lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, "mean-of-lifted", ALPHA_DBM)
     known = np.isfinite(lifted)
     if not known.any():
-        return (
-            f"{WITHOUT_CURVE}, without any power: the effect of power is unknown and contained in delays and errors, "
-            f"so delays from other distances will differ"
+        return warning(
+            WITHOUT_CURVE,
+            "delays only, without any power: the effect of power is unknown and contained in delays and errors, so "
+            "delays from other distances will differ",
         )
     low, high = np.percentile(_mean_dbm(ranges), (5, 95))
     number = equal_bins(lifted[known])
     middle = medians(residuals_m[known], number)[np.bincount(number) >= 20]
     reach = float(np.ptp(np.percentile(middle, (5, 95)))) if len(middle) else 0.0
-    return (
-        f"{WITHOUT_CURVE}: errors that change with power stay in the ranges, here {as_length(reach)} between "
+    return warning(
+        WITHOUT_CURVE,
+        f"delays only: errors that change with power stay in the ranges, here {as_length(reach)} between "
         f"{low:.0f} and {high:.0f} dBm; delays are averages over the recorded powers, and differ by up to "
-        f"{reach / SPEED_OF_LIGHT * 1e9:.2f} ns at single powers"
+        f"{reach / SPEED_OF_LIGHT * 1e9:.2f} ns at single powers",
     )
 
 
@@ -134,12 +143,12 @@ def _impossible(ranges: Ranges) -> Iterator[str]:
         )
 
 
-def initiator_warning(ranges: Ranges) -> Iterator[str]:
-    """Return a sentence about the pair whose ranges depend most on the initiator, a sign of uncorrected clock skew.
+def dependence_on_initiator(ranges: Ranges) -> Iterator[Finding]:
+    """Yield a finding about the pair whose ranges depend most on the initiator, a sign of uncorrected clock skew.
 
     Medians of raw errors show it even if a fit takes such ranges for reflections.
     """
-    ways = _medians_by_way(ranges.raw_m - ranges.truth_m, ranges)
+    ways = _medians_by_way(ranges.error_m, ranges)
     # Standard errors are for independent ranges. In the simulator's room, errors that last make variances of sums up to
     # 15 times as large, so eight of these standard errors are about two, and more is not by chance.
     differ_m = {
@@ -149,10 +158,11 @@ def initiator_warning(ranges: Ranges) -> Iterator[str]:
     }
     if differ_m:
         a, b = max(differ_m, key=lambda pair: abs(differ_m[pair]))
-        yield (
+        yield warning(
+            "clock skew",
             f"pair {a}-{b}: ranges are {100 * abs(differ_m[a, b]):.0f} cm "
             f"{'longer' if differ_m[a, b] > 0 else 'shorter'} if tag {a} initiates: clock skew is not corrected, or "
-            f"the carrier reading has the wrong sign"
+            f"the carrier reading has the wrong sign",
         )
 
 
@@ -194,65 +204,61 @@ LEAST_INLIERS: Final = 0.5
 reflected, delays depend on the minority; invented places leave 0 to 34 % (swarm broadcasts)."""
 
 
-def refuse_contradicted(inliers: float, ranges: Ranges, findings: Sequence[str]) -> None:
+def refuse_contradicted(inliers: float, ranges: Ranges, findings: Sequence[Finding]) -> None:
     """Raise `UnanswerableError`, with the findings, if most ranges contradict their own fit."""
     if inliers < LEAST_INLIERS:
-        evidence = "; ".join(findings) or "no single tag or pair explains it"
+        evidence = "; ".join(map(str, findings)) or "no single tag or pair explains it"
         raise UnanswerableError(
             f"{ranges.source}: {100 * (1 - inliers):.0f} % of the ranges lie outside three sigmas of this fit, which "
             f"is therefore useless; check the true distances, and which tag is at which position ({evidence})"
         )
 
 
-def implausible_values(delays_ns: Mapping[int, float], residuals_m: Floats) -> Iterator[str]:
-    """Yield sentences about fitted values that are implausible for hardware."""
+def implausible_values(delays_ns: Mapping[int, float], residuals_m: Floats) -> Iterator[Finding]:
+    """Yield findings about fitted values that are implausible for hardware."""
     spread, worst = robust_spread(residuals_m), max(delays_ns, key=lambda tag: abs(delays_ns[tag]), default=-1)
     # Boards of one kind differ by less than 2.5 ns: four times the difference of published delays (0.6 ns).
     if abs(delays_ns.get(worst, 0.0)) > 2.5:
-        yield (
-            f"tag {worst}: the delay of {delays_ns[worst]:+.1f} ns is larger than differences of boards (2.5 ns); "
-            f"check the unit of true distances, the order of stamps, the sign of carrier readings and the configured "
-            f"antenna delays"
+        yield warning(
+            "implausible delay",
+            f"tag {worst}: the delay of {delays_ns[worst]:+.1f} ns is larger than differences of boards (2.5 ns)",
         )
     if spread > LOUD_M:
-        yield f"errors spread by {spread:.2f} m after the fit, more than those of UWB ranges: check the true distances"
+        yield warning("large errors", f"errors spread by {spread:.2f} m after the fit, more than those of UWB ranges")
 
 
-def warnings_of(ranges: Ranges, inliers: float, seconds: float) -> Iterator[str]:
-    """Yield sentences about the data of a fit, the most serious first.
+def doubts_about_data(ranges: Ranges, inliers: float, seconds: float) -> Iterator[Finding]:
+    """Yield findings about the data of a fit, the most serious first.
 
     `inliers` is the share of ranges within three sigmas, `seconds` the time that ranges cover.
     """
     delays = known_delays(ranges.antenna_delays, ranges.tags())
     apart = [f"{tag} ({one})" for tag, one in delays.items() if tag is not None and one.reply != one.tx]
+    if apart:
+        yield warning(
+            "two antenna delays of a tag",
+            f"the stamps of tag{'s' * (len(apart) > 1)} {', '.join(apart)} contain two antenna delays, that of the "
+            f"register and a different constant in delayed replies: no single delay of a tag fits both",
+        )
     everything = len(ranges) + sum(ranges.excluded.values())
-    notes = (
-        f"the stamps of tag{'s' * (len(apart) > 1)} {', '.join(apart)} contain two antenna delays, that of the "
-        f"register and a different constant in delayed replies: no single delay of a tag fits both; program also the "
-        f"firmware's constants (`calib export --to firmware`), and record again"
-        if apart
-        else "",
-        *(
-            f"{100 * count / everything:.0f} % of the exchanges were left out: {reason}"
-            for reason, count in ranges.excluded.items()
-            if reason != STATIC and count > 0.05 * everything
-        ),
-        f"{100 * (1 - inliers):.0f} % of the ranges lie outside three sigmas of the calibrated errors"
-        if inliers < 0.6
-        else "",
-        f"only {seconds:.0f} s of data: too short to estimate persistent errors, so intervals may be too narrow"
-        if seconds < 25.0
-        else "",
-    )
-    yield from filter(None, notes)
+    for reason, count in ranges.excluded.items():
+        if reason != STATIC and count > 0.05 * everything:
+            text = f"{100 * count / everything:.0f} % of the exchanges were left out: {reason}"
+            yield warning("exchanges left out", text)
+    if inliers < 0.6:
+        text = f"{100 * (1 - inliers):.0f} % of the ranges lie outside three sigmas of the calibrated errors"
+        yield warning("ranges outside three sigmas", text)
+    if seconds < 25.0:
+        text = f"only {seconds:.0f} s of data: too short to estimate persistent errors, so intervals may be too narrow"
+        yield warning("short recording", text)
 
 
 SAME_LEVEL_DB: Final = 0.5
 """Smaller differences of levels of tags are ignored; medians of a pair's ranges are known to a tenth of this."""
 
 
-def power_level_warning(ranges: Ranges, calibration: Calibration) -> Iterator[str]:
-    """Return a sentence about tags whose powers differ from the others so much that their delays may contain an error.
+def unlike_power_levels(ranges: Ranges, calibration: Calibration) -> Iterator[Finding]:
+    """Yield a finding about tags whose powers differ from the others so much that their delays may contain an error.
 
     A frame and its answer take the same path, so a difference of their powers is due to the tags: transmit power and
     error of readings. Only the sum is visible. If a tag reads powers too high, its ranges get the correction of
@@ -274,10 +280,11 @@ def power_level_warning(ranges: Ranges, calibration: Calibration) -> Iterator[st
     if unlike:
         named = ", ".join(f"{tag} ({level:+.1f} dB)" for tag, level in unlike.items())
         held_ps = 1e3 * each_ns * max(map(abs, unlike.values()))
-        yield (
+        yield warning(
+            "power levels of tags",
             f"powers of tag{'s' * (len(unlike) > 1)} {named} differ from the others: the tags measure powers "
             f"wrongly, or transmit with another power; wrong powers change a tag's delay by up to {held_ps:.0f} ps "
-            f"here, which is right for ranges but not for the antenna"
+            f"here, which is right for ranges but not for the antenna",
         )
 
 

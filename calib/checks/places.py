@@ -16,7 +16,7 @@ from scipy import special
 from calib.estimator.known_distances import KnownDistances
 from calib.estimator.score_tests import Slopes, Tested
 from calib.estimator.time_blocks import TimeBlocks
-from calib.findings import SMALLEST_NS
+from calib.findings import SMALLEST_NS, Finding, warning
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 
@@ -33,14 +33,14 @@ SIZES_M = np.geomspace(3e-4, 0.2, 60)
 
 def place_covariance(
     found: KnownDistances, slopes: Slopes, pairs: Tested, before_ns2: Floats
-) -> tuple[Floats, list[str]]:
-    """Return the covariance (tags, tags) that place-dependent errors add to that of the delays, and a sentence if they
+) -> tuple[Floats, list[Finding]]:
+    """Return the covariance (tags, tags) that place-dependent errors add to that of the delays, and a finding if they
     matter.
 
     `pairs` are the slopes of offsets by pair, `before_ns2` is the covariance without places. Nothing is found if no
     body is known to carry two tags.
     """
-    nothing = np.zeros_like(before_ns2), list[str]()
+    nothing = np.zeros_like(before_ns2), list[Finding]()
     group = _pairs_of_bodies(found)
     if group is None:
         return nothing
@@ -72,16 +72,17 @@ def place_covariance(
     if max(deviation, stays, together) <= CERTAIN_DEVIATION or not np.any(more > np.maximum(own, SMALLEST_NS**2)):
         return widening, []
     near, directions = "as near walls and objects", "pattern" not in found.model.covariates
-    wrong, check = f"reflected together, {near}, and trajectories may have followed them", ""
+    wrong = f"reflected together, {near}, and trajectories may have followed them"
     if certain:
         other = ", or an antenna whose delay depends on the direction" * directions
-        wrong, check = f"wrong together, {near}, or a wrong lever arm{other}", "check the lever arms, then "
-    return widening, [
+        wrong = f"wrong together, {near}, or a wrong lever arm{other}"
+    text = (
         f"errors depend on places{' or directions' * (certain and directions)}: ranges between the same two bodies "
         f"are {wrong}, which may change differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals are "
-        f"widened for this; {check}record also at other places, or farther from walls: a common error of all ranges "
-        f"cannot be detected"
-    ]
+        f"widened for this"
+    )
+    p_value = float(special.ndtr(-max(deviation, stays, together)))
+    return widening, [warning("errors of places", text, p_value)]
 
 
 def _deviation_of_mixture(likely: Floats) -> float:

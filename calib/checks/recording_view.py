@@ -21,7 +21,7 @@ from calib.data.sources import RecordedSource, Source
 from calib.estimator.known_distances import FEWEST_RANGES, PILOT, Fitted, fit_likelihood, model_of, robust_fit
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import METRES_A_NS, RangeModel
-from calib.estimator.range_rows import RESIDUAL, Part, RangeRows, Robust
+from calib.estimator.range_rows import RangeRows, Robust, block_of
 from calib.estimator.score_tests import REACHED, Family, Slopes, Tested
 from calib.estimator.time_blocks import TimeBlocks, time_blocks
 from calib.estimator.unknowns import Priors, Unknown
@@ -74,14 +74,9 @@ class RecordingView:
         This is two wavelengths, over which power hardly varies.
         """
         good = np.isfinite(self.ranges.truth_m)
-        pair, truth_m = pairs_of(self.ranges.initiator, self.ranges.target).number[good], self.ranges.truth_m[good]
+        pair, truth_m = self.ranges.pairs.number[good], self.ranges.truth_m[good]
         span_m = max((float(np.ptp(truth_m[pair == one])) for one in np.unique(pair)), default=np.inf)
         return span_m if span_m < 0.1 else None
-
-    @property
-    def error_m(self) -> Floats:
-        """Range minus truth, shape (n,)."""
-        return self.ranges.raw_m - self.ranges.truth_m
 
     def chosen(self, rows: Bools | Ints) -> RecordingView:
         """Return a view of some exchanges."""
@@ -271,12 +266,10 @@ class QuickFit:
         """
         pairs = np.ones(len(self.model.pairs.names)) if pairs is None else pairs
         derivative = pairs[self.model.pairs.number] * course
-        offset = Unknown(kind="offset", names=("",), start=np.zeros(1))
-        part = Part(
-            parameter=RESIDUAL,
-            kind="offset",
-            columns=np.zeros((len(derivative), 1), dtype=np.int64),
-            values=derivative[:, None],
+        offset, part = block_of(
+            Unknown(kind="offset", names=("",), start=np.zeros(1)),
+            np.zeros((len(derivative), 1), dtype=np.int64),
+            derivative[:, None],
         )
         kinds = tuple(self.start.optimum.layout.where)
         _, ranges = self.model.build(self.error, self.start.rows.errors, [offset], [part], only=kinds)
@@ -303,7 +296,7 @@ def quick_fit(views: Sequence[RecordingView], constants: str = "pair", ranges_a_
         return None
     ranges = concatenate([view.ranges[rows] for view, rows in zip(views, kept, strict=True)])
     model = model_of(ranges, FitSettings(constants=constants), trimmed=False)
-    error, kinds = model.ranges.raw_m - model.ranges.truth_m, ("delay", *model.curve_kinds())
+    error, kinds = model.ranges.error_m, ("delay", *model.curve_kinds())
     # Convex, so that steps from zero find offsets of any size; its slope is bounded, so that reflections have little
     # more weight than other ranges.
     start = robust_fit(model, error, "soft_l1", None, kinds, sample=PILOT)
@@ -312,7 +305,7 @@ def quick_fit(views: Sequence[RecordingView], constants: str = "pair", ranges_a_
 
 def _of_common_pairs(view: RecordingView, ranges_a_pair: int) -> Ints:
     """Return the rows with a true distance of pairs that have enough of them, by time."""
-    rows = np.flatnonzero(np.isfinite(view.error_m))
+    rows = np.flatnonzero(np.isfinite(view.ranges.error_m))
     rows = rows[np.argsort(view.exchanges.time_ns[rows], kind="stable")]
-    pair = pairs_of(view.ranges.initiator[rows], view.ranges.target[rows]).number
+    pair = view.ranges.pairs.number[rows]
     return np.asarray(rows[np.bincount(pair)[pair] >= ranges_a_pair])

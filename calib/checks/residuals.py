@@ -88,7 +88,7 @@ def skew(view: RecordingView) -> Iterator[Candidate]:
     sign.
     """
     e = view.exchanges
-    single = np.isin(e.protocol, single_sided()) & np.isfinite(view.error_m) & ~without_stamps(e)
+    single = np.isin(e.protocol, single_sided()) & np.isfinite(view.ranges.error_m) & ~without_stamps(e)
     taken = {corrected(name) for name in np.unique(e.protocol[single]).tolist()}
     if len(taken) != 1:
         return

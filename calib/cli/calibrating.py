@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -251,7 +251,7 @@ def _survey_figures(result: calib.SurveyResult) -> dict[str, Any]:
         "calibration": json.loads(result.calibration.to_json()),
         "arrangements": [one.to_dict() for one in result.arrangements],
         "pair_error_m": result.pair_error_m,
-        "findings": list(result.findings),
+        "findings": [asdict(one) for one in result.findings],
         "reflected": [one.to_dict() for one in result.reflected],
         "warnings": [with_flags(text) for text in result.warnings],
     }

@@ -16,7 +16,7 @@ from scipy import ndimage
 from calib.data.arrivals import LARGEST_ERROR_M, Arrivals
 from calib.data.clocks import ClocksApart, LeftSkew, clocks_apart, left_skew
 from calib.errors import BadInputError, UnanswerableError
-from calib.pairs import pairs_of
+from calib.pairs import Pairs, pairs_of
 from calib.spread import less_medians, robust_spread
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.errors import ArgumentError, ImportTableError, raising, warn
@@ -330,6 +330,21 @@ class Ranges(ColumnTable):
         """Mask (n,) of rows that are differences of arrival without stamps."""
         return np.asarray(self.listener >= 0)
 
+    @property
+    def ends(self) -> Ints:
+        """Initiator and target of each range (n, 2)."""
+        return np.column_stack([self.initiator, self.target])
+
+    @property
+    def pairs(self) -> Pairs:
+        """The pair of tags of each range, in either direction."""
+        return pairs_of(self.initiator, self.target)
+
+    @property
+    def error_m(self) -> Floats:
+        """Range minus true distance (n,), metres."""
+        return self.raw_m - self.truth_m
+
     def __getitem__(self, rows: int | slice | Bools | Ints) -> Ranges:
         """Return the chosen ranges, in their order, with their arrivals."""
         found = ColumnTable.__getitem__(self, rows)
@@ -352,7 +367,7 @@ class Ranges(ColumnTable):
         """Return the table, and a figure of errors over time; of ranges over time if no true distance is known."""
         from uwblink.pages.figures import notebook_image, values_over_time
 
-        errors, name = 100 * (self.raw_m - self.truth_m), "raw range minus true distance (cm)"
+        errors, name = 100 * self.error_m, "raw range minus true distance (cm)"
         values, name = (errors, name) if np.isfinite(errors).any() else (self.raw_m, "raw range (m)")
         draw = partial(values_over_time, time_ns=self.time_ns, values=values, name=name)
         return ColumnTable._repr_html_(self) + notebook_image(draw, f"{name} over time")
@@ -581,7 +596,7 @@ def without_static(ranges: Ranges, *, span_s: float = 2.0, within_m: float = 0.0
     Bodies that stand still repeat one geometry, and with it one error. Raises `UnanswerableError` if nothing moves.
     """
     span = (ranges.time_ns - ranges.time_ns.min()) // int(span_s * 1e9)
-    pairs = pairs_of(ranges.initiator, ranges.target)
+    pairs = ranges.pairs
     group = np.unique(span * len(pairs.ends) + pairs.number, return_inverse=True)[1]
     every = np.arange(group.max() + 1)
     reach = ndimage.maximum(ranges.truth_m, group, every) - ndimage.minimum(ranges.truth_m, group, every)
@@ -599,7 +614,7 @@ def held_out(ranges: Ranges, share: float, fold: str) -> Bools:
     Raises `UnanswerableError` if nothing is left to fit, or nothing is held out.
     """
     if fold == "pair":
-        unit = pairs_of(ranges.initiator, ranges.target).number
+        unit = ranges.pairs.number
     elif fold == "session":
         unit = np.unique(ranges.session, return_inverse=True)[1]
     else:

@@ -163,13 +163,27 @@ def load_each(
         else load_flight(one, need_power=need_power, use=use).ranges
         for one in given
     ]
-    seen: dict[str, str] = {}
-    for part in (p for one, p in zip(given, parts, strict=True) if not isinstance(one, Ranges)):
-        for name, found in part.recordings:
-            if found in seen:
-                raise BadInputError(f"{name}: contains the same exchanges as {seen[found]}; give each recording once")
-            seen[found] = name
+    loaded = [part for one, part in zip(given, parts, strict=True) if not isinstance(one, Ranges)]
+    refuse_repeated(recording for part in loaded for recording in part.recordings)
     return [without_static(part) for part in parts] if trim_static else parts
+
+
+def fingerprint_of(exchanges: Exchanges, *more: Floats) -> str:
+    """Return a fingerprint of exchanges, and of `more` columns."""
+    columns = (exchanges.time_ns, exchanges.range_m, *more)
+    return sha256(b"".join(column.tobytes() for column in columns)).hexdigest()[:32]
+
+
+def refuse_repeated(recordings: Iterable[tuple[str, str]]) -> None:
+    """Raise `BadInputError` if two recordings, given by name and fingerprint, hold the same exchanges.
+
+    Counted twice, exchanges make intervals too narrow by the root of 2.
+    """
+    seen: dict[str, str] = {}
+    for name, fingerprint in recordings:
+        if fingerprint in seen:
+            raise BadInputError(f"{name}: contains the same exchanges as {seen[fingerprint]}; give each recording once")
+        seen[fingerprint] = name
 
 
 def each(data: Data | Iterable[Data]) -> list[Data]:
@@ -364,9 +378,7 @@ def load_flight(
         count = len(bare.get("time_ns", ()))
         if count:
             found = _with_differences(found, bare, source, need_power=need_power, use=use)
-        content = exchanges.time_ns.tobytes() + exchanges.range_m.tobytes()
-        content += bare["difference_m"].tobytes() if count else b""
-        fingerprint = sha256(content).hexdigest()[:32]
+        fingerprint = fingerprint_of(exchanges, *([bare["difference_m"]] if count else []))
         reasons = _why_no_truth(source), _why_no_power(exchanges)
         usable = found.usable(*reasons, need_power=need_power, need_truth=need_truth)
         tables = {table: dict(getattr(source, table, None) or {}) for table in sensors}

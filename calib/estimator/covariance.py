@@ -14,14 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.special import stdtrit
 
 from calib.estimator.inverse import trace_of_product
 from calib.estimator.optimize import Optimum
 from calib.estimator.rows import Rows, sum_rows
 from calib.estimator.score_tests import Slopes
 from calib.estimator.time_blocks import Persistence, persistence
-from calib.spread import TWO_SIDED_95
+from calib.spread import students_factor
 from uwblink.arrays import Floats, Ints
 
 CURVE_SERIES = 5
@@ -91,7 +90,7 @@ def sandwich(
         reach = optimum.covariance[:, group.indices]
         series = slopes.own @ reach
         lasting = persistence(series @ group.combinations.T, slopes.blocks, group.independent)
-        width = max(lasting.quantile95, float(stdtrit(group.freedom, 0.975))) / TWO_SIDED_95
+        width = students_factor(min(lasting.freedom, group.freedom))
         sampled = inflation * lasting.factor * width**2 * (series.T @ series)
         found[name] = sampled + reach.T @ (stated @ reach) + of_weights(optimum, group.indices), lasting
     return found
@@ -121,6 +120,5 @@ def of_few_draws(optimum: Optimum, keep: Ints) -> Floats:
     the variance of a prior: its part of the covariance is scaled from a normal distribution to Student's t."""
     found, priors, reach = np.zeros((len(keep),) * 2), optimum.priors, optimum.covariance[:, keep]
     for (where, prior), weight, structure in zip(priors.all, priors.weights, priors.structures, strict=True):
-        width = float(stdtrit(prior.freedom, 0.975)) / TWO_SIDED_95
-        found += (width**2 - 1) * weight * reach[where].T @ (structure @ reach[where])
+        found += (students_factor(prior.freedom) ** 2 - 1) * weight * reach[where].T @ (structure @ reach[where])
     return found

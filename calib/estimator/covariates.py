@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.calibration.patterns import harmonics
 from calib.data.ranges import Ranges
-from calib.estimator.range_rows import RESIDUAL, Part
+from calib.estimator.range_rows import Part, block_of
 from calib.estimator.unknowns import Prior, Unknown
 from calib.pairs import Pairs
 from uwblink.arrays import Bools, Floats, Ints
@@ -68,8 +68,7 @@ class Covariate:
     @classmethod
     def of_directions(cls, ranges: Ranges) -> Covariate:
         """Return harmonics over directions; without tags where no direction is known or no body turns."""
-        ends = np.stack([ranges.initiator, ranges.target], axis=1)
-        some = np.isfinite(ranges.toward).all(axis=2) & np.isin(ends, ranges.turning)
+        some = np.isfinite(ranges.toward).all(axis=2) & np.isin(ranges.ends, ranges.turning)
         return cls._of(ranges, some, harmonics(ranges.toward[some]), LEAST_SQUARE)
 
     @classmethod
@@ -81,8 +80,7 @@ class Covariate:
     @classmethod
     def _of(cls, ranges: Ranges, some: Bools, known: Floats, least_square: float) -> Covariate:
         """Return the `known` values (m, k) of `some` ends (n, 2), without those that hardly vary."""
-        ends = np.stack([ranges.initiator, ranges.target], axis=1)
-        values = np.zeros((*ends.shape, known.shape[1]))
+        values = np.zeros((*some.shape, known.shape[1]))
         centre, span = np.zeros(known.shape[1]), np.zeros((2, known.shape[1]))
         if len(known):
             centre, span = known.mean(axis=0), np.array([known.min(axis=0), known.max(axis=0)])
@@ -95,7 +93,7 @@ class Covariate:
         del known
         first = np.where(ranges.initiator < ranges.target, 0, 1)
         lower, higher = (values[np.arange(len(ranges)), side] for side in (first, 1 - first))
-        tags, bodies = tuple(np.unique(ends[some]).tolist()), dict(ranges.bodies)
+        tags, bodies = tuple(np.unique(ranges.ends[some]).tolist()), dict(ranges.bodies)
         return cls(tags=tags, centre=centre, lower=lower, higher=higher, square=square, span=span, bodies=bodies)
 
     def entries(self, kind: str, pairs: Pairs) -> tuple[tuple[str, ...], Ints, Floats]:
@@ -130,7 +128,7 @@ class Covariate:
         for kind in kinds:
             names, columns, values = self.entries(kind, pairs)
             unknown = Unknown(kind=kind, names=names, start=np.zeros(len(names)), priors=(PRIORS[kind],))
-            yield unknown, Part(parameter=RESIDUAL, kind=kind, columns=columns, values=-values)
+            yield block_of(unknown, columns, -values)
 
 
 OF_PLACES = (OF_BODIES, OF_PAIR)

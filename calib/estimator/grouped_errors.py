@@ -17,7 +17,7 @@ from scipy.special import expit, logit
 from calib.calibration.error_model import ErrorModel, FeatureSlope
 from calib.data.ranges import FEATURES, Ranges
 from calib.estimator.optimize import maximize
-from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows
+from calib.estimator.range_rows import Mixture, Part, RangeRows, block_of
 from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
@@ -126,9 +126,7 @@ class ReflectionFeatures:
         """Return the slopes of the log odds as unknowns, and the part that ranges have in them."""
         names = (*(FEATURES[k] for k in self.number), "unknown")
         unknown = logarithms("odds of feature", names, np.zeros(len(names)), Prior.of_deviation(1.0))
-        return unknown, Part(
-            parameter="odds", kind="odds of feature", columns=np.arange(len(names))[None], values=self.values
-        )
+        return block_of(unknown, np.arange(len(names))[None], self.values, parameter="odds")
 
     def state(self, stated: ErrorModel, slopes: Floats, share: Floats) -> ErrorModel:
         """Return an error model with the features whose `slopes` (k + 1,) were fitted.
@@ -181,16 +179,19 @@ def fit_grouped_errors(groups: Sequence[Floats], most: int = 20_000) -> GroupedE
     parts = [part for part in parts if part.kind != "noise level"]
     log_spread = np.log(spread)
     unknowns.append(logarithms("noise of group", names, log_spread, Prior.of_deviation(2.0, log_spread)))
-    centre = Unknown(kind="centre", names=names, start=np.zeros(count), priors=(Prior.of_deviation(100.0),))
-    parts.append(Part(parameter=RESIDUAL, kind="centre", columns=group[:, None], values=np.full((len(group), 1), -1.0)))
+    centre, of_centre = block_of(
+        Unknown(kind="centre", names=names, start=np.zeros(count), priors=(Prior.of_deviation(100.0),)),
+        group[:, None],
+        np.full((len(group), 1), -1.0),
+    )
     layout = Layout((centre, *unknowns))
-    rows = RangeRows.of(error_m - middle[group], group, parts, Mixture(), layout)
+    rows = RangeRows.of(error_m - middle[group], group, [*parts, of_centre], Mixture(), layout)
     found = maximize([rows], Priors(layout), layout.start())
     each = rows.error_slopes(found.x, ())
-    of_centre = layout.where["centre"]
+    which = layout.where["centre"]
     return GroupedErrors(
         centre_m=middle + found.of("centre"),
-        centre_std_m=np.sqrt(np.diag(found.covariance[of_centre, of_centre])),
+        centre_std_m=np.sqrt(np.diag(found.covariance[which, which])),
         sigma_m=np.exp(found.of("noise of group")),
         reflected=np.bincount(group, each.reflected) / size,
         detour_m=np.exp(found.of("least detour")[0]) + np.exp(found.of("detour level") + found.of("detour of group")),

@@ -21,7 +21,7 @@ from calib.estimator.covariates import COMMON, OWN, OWN_WARMTH, WARMTH
 from calib.estimator.losses import LOSSES, MIXTURE
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import METRES_A_NS, RangeModel
-from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows, Robust
+from calib.estimator.range_rows import RESIDUAL, Mixture, RangeRows, Robust, block_of
 from calib.estimator.rows import NormalRows, Rows
 from calib.estimator.score_tests import Slopes
 from calib.estimator.time_blocks import Persistence, TimeBlocks, in_order, time_blocks
@@ -139,7 +139,7 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances
         raise BadInputError(
             "all delays are known and no curve is fitted, so there is nothing to fit", parameter="fixed_ns"
         )
-    error = model.ranges.raw_m - model.ranges.truth_m
+    error = model.ranges.error_m
     blocks = time_blocks(model.ranges.time_ns, model.ranges.session)
     loss = settings.loss or (ROBUST_LOSS if settings.sequential or settings.delays_only else MIXTURE)
     scale_m = None if settings.scale_ns is None else settings.scale_ns * METRES_A_NS
@@ -400,8 +400,8 @@ def described_errors(found: KnownDistances) -> DescribedErrors:
         noise = found.covariances["noise"]
     else:
         mixture, unknowns, parts = model.error_model(found.residuals)
-        centre = Unknown(kind="centre", names=("",), start=np.array([-float(np.median(found.residuals))]))
-        everyone = Part(parameter=RESIDUAL, kind="centre", columns=np.zeros((1, 1), dtype=np.int64))
+        start = np.array([-float(np.median(found.residuals))])
+        centre, everyone = block_of(Unknown(kind="centre", names=("",), start=start), np.zeros((1, 1), dtype=np.int64))
         layout, rows = model.build(found.residuals, mixture, [centre, *unknowns], [everyone, *parts], only=())
         optimum, _ = _maximize_by_samples([rows], (), layout, layout.start())
         x, location, values = optimum.x, -float(optimum.of("centre")[0]), optimum.by_kind()

@@ -14,7 +14,8 @@ import numpy as np
 from scipy import sparse
 
 from calib.estimator.inverse import Inverse, Matrix, inverse_of
-from calib.estimator.rows import RestrictedRows, Rows, Sums, sum_rows
+from calib.estimator.range_rows import RangeRows
+from calib.estimator.rows import Rows, Sums, sum_rows
 from calib.estimator.unknowns import Layout, Priors
 from uwblink.arrays import Floats, Ints
 
@@ -135,7 +136,7 @@ def maximize(  # noqa: PLR0913 - a search has that many sides
 
 def _with_uncertainty(rows: Sequence[Rows], priors: Priors, x: Floats) -> Sequence[Rows]:
     """Return the rows with the variances of residuals if their likelihood depends on these, else the same rows."""
-    own = {k: one for k, one in enumerate(rows) if isinstance(one, RestrictedRows) and one.restricted}
+    own = {k: one for k, one in enumerate(rows) if isinstance(one, RangeRows) and one.restricted}
     if not own:
         return rows
     expecting = [own[k].expecting() if k in own else one for k, one in enumerate(rows)]

@@ -1,7 +1,8 @@
 """The model of ranges besides their distances: delays, curves over power, offsets, and parameters of errors.
 
-`RangeModel.of` makes unknowns and parts of these for any ranges. Fits to known distances, surveys and flights share it,
-and differ only in the source of distances.
+`RangeModel.of` makes the unknowns and the parts of ranges from them. Fits to known distances and flights without them
+share it and differ only in the source of distances. Surveys use it for the mean ranges of pairs, from which
+`calib.surveys.network` estimates positions and delays.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.covariates import COVARIATES, Covariate
 from calib.estimator.grouped_errors import ReflectionFeatures, error_unknowns, logarithms, scattered
 from calib.estimator.identifiability import free_directions
-from calib.estimator.range_rows import RESIDUAL, Errors, Mixture, Part, RangeRows
+from calib.estimator.range_rows import Errors, Mixture, Part, RangeRows, block_of
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown
-from calib.pairs import Pairs, pairs_of
+from calib.pairs import Pairs
 from calib.settings import FitSettings
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
@@ -129,7 +130,7 @@ class RangeModel:
             ordered = ordered[np.searchsorted(ordered, low) : np.searchsorted(ordered, high, side="right")]
         tags = ranges.tags()
         _check_tags(ranges, tags, settings)
-        pairs = pairs_of(ranges.initiator, ranges.target)
+        pairs = ranges.pairs
         held, free = _free_directions(ranges, tags, settings)
         blocks = [_constants(ranges, pairs, tags, settings)]
         bias = noise = None
@@ -286,16 +287,14 @@ def _constants(ranges: Ranges, pairs: Pairs, tags: list[int], settings: FitSetti
     prior = (Prior.of_deviation(DELAY_NS),)
     if settings.constants == "pair":
         block = Unknown(kind="delay", names=pairs.names, start=np.zeros(len(pairs.ends)), priors=prior)
-        values = np.full((len(ranges), 1), METRES_A_NS)
-        return block, Part(parameter=RESIDUAL, kind="delay", columns=pairs.number[:, None], values=values)
+        return block_of(block, pairs.number[:, None], np.full((len(ranges), 1), METRES_A_NS))
     known = np.array([tag in settings.fixed_ns for tag in tags])
     start = np.array([settings.fixed_ns.get(tag, 0.0) for tag in tags])
     block = Unknown(kind="delay", names=tuple(map(str, tags)), start=start, known=known, priors=prior)
-    columns = np.searchsorted(tags, pairs.ends)[pairs.number]
     lower_first = (ranges.initiator < ranges.target)[:, None]
     weights = np.column_stack([ranges.weight_initiator, ranges.weight_target])
     values = METRES_A_NS * np.where(lower_first, weights, weights[:, ::-1])
-    return block, Part(parameter=RESIDUAL, kind="delay", columns=columns, values=values)
+    return block_of(block, pairs.among(tags), values)
 
 
 def _curve(kind: str, spline: SplineValues, share: Floats | None) -> tuple[Unknown, Part]:
@@ -308,7 +307,7 @@ def _curve(kind: str, spline: SplineValues, share: Floats | None) -> tuple[Unkno
         priors=(rough, Prior.of_deviation(CURVE_M)),
     )
     values = -spline.values if share is None else -share[:, None] * spline.values
-    return block, Part(parameter=RESIDUAL, kind=kind, columns=spline.columns, values=values)
+    return block_of(block, spline.columns, values)
 
 
 TYPICAL_OFFSET_M = 0.035
@@ -322,18 +321,16 @@ def _offsets(ranges: Ranges, pairs: Pairs, tags: list[int], *, freedom: int) -> 
     """Yield offsets of pairs, if ranges determine some, and of pairs and tags in each of several sessions."""
     number, count = pairs.number[:, None], len(ranges.sessions)
     if freedom > 0:
-        kind = "offset of pair"
-        yield scattered(kind, pairs.names, OFFSETS, freedom), Part(parameter=RESIDUAL, kind=kind, columns=number)
+        yield block_of(scattered("offset of pair", pairs.names, OFFSETS, freedom), number)
     if count < 2:
         return
-    ends = np.searchsorted(tags, pairs.ends)[pairs.number]
     for kind, whose, columns in (
         ("offset of pair in session", pairs.names, number),
-        ("offset of tag in session", tuple(map(str, tags)), ends),
+        ("offset of tag in session", tuple(map(str, tags)), pairs.among(tags)),
     ):
         names = tuple(f"{name} in {where}" for name in whose for where in ranges.sessions)
         own: Ints = np.asarray(columns.astype(np.int64) * count + ranges.session[:, None], dtype=np.int32)
-        yield scattered(kind, names, OFFSETS), Part(parameter=RESIDUAL, kind=kind, columns=own)
+        yield block_of(scattered(kind, names, OFFSETS), own)
 
 
 def free_ends(pairs: Pairs, tags: list[int], settings: FitSettings) -> Floats:

@@ -18,7 +18,7 @@ from scipy.interpolate import CubicHermiteSpline, PPoly
 from calib.estimator.inverse import Inverse, diagonal_of
 from calib.estimator.losses import Weights
 from calib.estimator.rows import ROWS_AT_ONCE, Squares, Terms
-from calib.estimator.unknowns import Layout
+from calib.estimator.unknowns import Layout, Unknown
 from calib.range_errors.densities import ErrorSlopes, error_slopes
 from uwblink.arrays import Floats, Ints
 
@@ -43,6 +43,13 @@ class Part:
     kind: str
     columns: Ints
     values: Floats | None = None
+
+
+def block_of(
+    unknown: Unknown, columns: Ints, values: Floats | None = None, *, parameter: str = RESIDUAL
+) -> tuple[Unknown, Part]:
+    """Return a block of unknowns and its share of a parameter: `columns` and `values` are those of `Part`."""
+    return unknown, Part(parameter=parameter, kind=unknown.kind, columns=columns, values=values)
 
 
 class Geometry(Protocol):

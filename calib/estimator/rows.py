@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 from scipy import sparse
 
-from calib.estimator.inverse import MOST_DENSE, Inverse, Matrix
+from calib.estimator.inverse import MOST_DENSE, Matrix
 from uwblink.arrays import Floats, Ints
 
 ROWS_AT_ONCE = 16_384
@@ -66,24 +66,6 @@ class Rows(Protocol):
 
     def terms(self, x: Floats) -> Iterable[Terms]:
         """Yield all rows at unknowns (p,), some at a time."""
-        ...
-
-
-@runtime_checkable
-class RestrictedRows(Rows, Protocol):
-    """Rows whose likelihood depends on the uncertainty of their residuals."""
-
-    @property
-    def restricted(self) -> bool:
-        """Whether this dependence matters."""
-        ...
-
-    def expecting(self) -> Rows:
-        """Return the rows with expected information instead of squares of slopes."""
-        ...
-
-    def with_uncertainty(self, x: Floats, covariance: Inverse) -> Rows:
-        """Return the rows with the variances of their residuals at unknowns (p,) with a covariance (p, p)."""
         ...
 
 
@@ -157,8 +139,7 @@ class NormalRows:
 
     def terms(self, x: Floats) -> Iterator[Terms]:
         """Yield all rows."""
-        if len(self.value):
-            yield normal_terms(self.left(x), self.std, self.entries.T, self.columns)
+        yield normal_terms(self.left(x), self.std, self.entries.T, self.columns)
 
 
 def normal_terms(left: Floats, std: Floats, derivative: Floats, columns: Ints) -> Terms:

@@ -15,7 +15,6 @@ from typing import Final
 
 import numpy as np
 from scipy import sparse
-from scipy.special import stdtrit
 
 from calib.data.ranges import Ranges
 from uwblink.arrays import Floats, Ints
@@ -111,11 +110,6 @@ class Persistence:
     freedom: float
     stretches: float
     stretch_s: float
-
-    @property
-    def quantile95(self) -> float:
-        """Half the width of a 95 % interval, in standard errors."""
-        return float(stdtrit(self.freedom, 0.975))
 
 
 def lasting_in_pairs(slope: Floats, pair: Ints, blocks: TimeBlocks, spans: int = 1) -> float:

@@ -130,34 +130,29 @@ class GaussianFilters:
         """Add variances to those of some states."""
         np.einsum("...ii->...i", self.covariance)[..., states] += variance
 
-    def append(self, delays: DelayStates) -> slice:
-        """Append states of delays, and return their indices. They are shared errors in metres that do not decay."""
-        size, count = self.state.shape[-1], len(delays.tags)
+    def append(self, covariance: Floats) -> slice:
+        """Append states of zero with a covariance (k, k), and return their indices."""
+        size, count = self.state.shape[-1], len(covariance)
         self.state = np.concatenate([self.state, np.zeros((*self.state.shape[:-1], count))], axis=-1)
         around = [(0, 0)] * (self.covariance.ndim - 2) + [(0, count)] * 2
         self.covariance = np.pad(self.covariance, around)
-        self.covariance[..., size:, size:] = delays.covariance_m2
-        self.delays, self.changes = delays, slice(size, size + count)
-        return self.changes
+        self.covariance[..., size:, size:] = covariance
+        return slice(size, size + count)
+
+    def append_delays(self, delays: DelayStates) -> None:
+        """Append states of delays (`changes`): shared errors in metres that do not decay."""
+        self.delays, self.changes = delays, self.append(delays.covariance_m2)
 
     def wander(self, dt: float) -> None:
         """Let delays change for `dt` seconds."""
         self.add_variance(self.changes, self.delays.walk_m**2 * dt)
 
-    def delays_at(self, filter_: tuple[int, ...], delays: DelayStates, *, drift: Any) -> dict[int, tuple[float, float]]:
-        """Return the delays that one of the filters estimates as states (`DelayStates.estimates`), or the calibration's
-        delays if its delays do not `drift`."""
-        if not (delays.tags and drift):
-            return delays.estimates()
-        return delays.estimates(self.state[filter_][self.changes], self.covariance[filter_][self.changes, self.changes])
-
-    def decay(self, kept: Floats) -> None:
-        """Let shared errors decay to shares `kept` (..., states) of their values, with constant standard deviation."""
-        others = slice(self.known, self.known + kept.shape[-1])
-        self.state[..., others] *= kept
-        self.covariance[..., others, :] *= kept[..., None]
-        self.covariance[..., others] *= kept[..., None, :]
-        self.add_variance(others, 1 - kept**2)
+    def decay(self, errors: slice, kept: Floats) -> None:
+        """Let shared errors decay to shares `kept` (..., k) of their values, with constant standard deviation."""
+        self.state[..., errors] *= kept
+        self.covariance[..., errors, :] *= kept[..., None]
+        self.covariance[..., errors] *= kept[..., None, :]
+        self.add_variance(errors, 1 - kept**2)
 
     def forget(self, states: Any, covariance: Floats) -> None:
         """Set states to zero, with a covariance, and independent of all others."""
@@ -383,7 +378,7 @@ class InertialFilter(RelativeFilter):
             noise = replace(noise, force=noise.acceleration, gyro=0.0, gyro_bias=0.0, force_bias=0.0)
         spread[H] = 0.15
         super().__init__(fix.place_m, np.resize(attitudes[:, None], (len(self.drift), 1, 3, 3)), spread, noise)
-        self.append(delays)
+        self.append_delays(delays)
         self.restart(fix, speed_m_s)
 
     @property

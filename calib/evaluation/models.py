@@ -113,56 +113,86 @@ class ModelAverage:
 
 
 class FilterBank:
-    """Filters with the same measurements (n,), and their averages.
+    """Filters with the same measurements (n,), their shared errors, and their averages.
 
-    `running` are filters (filters, ...); states of delays are appended to theirs (`delays`). `uses` (n, filters) are
-    the measurements that each uses, from `pairs` pairs of tags. They update by a gate, or by an error model with
-    reflections that last. `common`, `shared` and `slopes` are from `side_by_side`; `measured` is (n, filters, ...).
+    A measurement is a sum of distances between pairs of tags, numbered by `pair` (n, k), with signs (n, k); `uses` (n,
+    filters) are the measurements that each filter uses. They update by a gate, or by an error model with reflections
+    that last. To the states of the filters `running` (filters, ...) are appended: `errors` in units of their standard
+    deviation, of each pair and then of an exchange; `constants` of pairs, if a filter has any; and delays. `slopes` are
+    the derivatives by delays, `measured` is (n, filters, ...).
     """
 
     def __init__(
-        self, known: Sequence[FilterRanges], running: GaussianFilters, gate: float, uses: Bools, pairs: int
+        self,
+        known: Sequence[FilterRanges],
+        running: GaussianFilters,
+        gate: float,
+        uses: Bools,
+        pair: Ints,
+        sign: Floats,
     ) -> None:
         """Begin without information on errors."""
-        self.known, self.running, shape = known, running, running.state.shape[1:-1]
-        measured, std, self.common, self.shared, self.slopes = side_by_side(known)
+        self.known, self.running, self.pair, self.sign = known, running, pair, sign
+        shape, pairs = running.state.shape[1:-1], int(pair.max()) + 1
+        measured, std, common, shared, slopes = side_by_side(known)
         around = (..., *(None for _ in shape))
         self.measured, self.variance, self.uses = (
             np.broadcast_to(one[around], (*one.shape, *shape)) for one in (measured, std**2, uses)
         )
-        self.delays = running.append(delay_states(known))
+        self.common, self.shared = common[around], shared[around]
+        self.slopes = np.expand_dims(slopes, tuple(range(2, 2 + len(shape))))
+        self.lasting_s, self.offset_m = (
+            np.array([getattr(one, name) for one in known])[around] for name in ("lasting_s", "offset_m")
+        )
+        self.of_pair = np.arange(pairs + 1) < pairs
+        self.errors = running.append(np.eye(pairs + 1))
+        self.constants = running.append(np.eye(pairs if self.offset_m.any() else 0))
+        running.append_delays(delay_states(known))
         # All filters with an error model have the calibration's.
         self.gate, self.average = gate, ModelAverage(known, shape)
         self.robust = [f for f, one in enumerate(known) if one.errors is not None]
         first = known[self.robust[0]] if self.robust else known[0]
-        self.errors, self.reflections = first.errors, Reflections(first.renewal_s, (len(self.robust), *shape, pairs))
+        self.error_model = first.errors
+        self.reflections = Reflections(first.renewal_s, (len(self.robust), *shape, pairs))
         self.judged = np.empty((4, len(uses), len(self.average.shown), *shape))
 
-    def observe(self, row: int, slopes: Floats, expected: Floats, pair: Ints) -> WeighedInnovation:
-        """Update the filters that use measurement `row` between pairs (k,); return the updates of all.
+    def observe(self, row: int, slopes: Floats, expected: Floats) -> WeighedInnovation:
+        """Update the filters that use measurement `row`; return the updates of all.
 
-        `expected` (filters, ...) is the expected measurement, with derivatives `slopes` (filters, ..., states).
+        `expected` (filters, ...) is the expected measurement without shared errors, with derivatives `slopes` (filters,
+        ..., states), to which those by shared errors, constants and delays are added.
         """
+        for which, pair in enumerate(self.pair[row].tolist()):
+            slopes[..., self.errors.start + pair] += self.shared[row, :, which]
+            if self.constants.start < self.constants.stop:
+                slopes[..., self.constants.start + pair] += self.sign[row, which] * self.offset_m
+        slopes[..., self.errors.stop - 1] = self.common[row]
+        slopes[..., self.running.changes] = self.slopes[row]
         used, innovation = self.uses[row], self.measured[row] - expected
-        weigh = partial(self._weigh, row, pair)
+        weigh = partial(self._weigh, row)
         update = self.running.update(slopes * used[..., None], innovation, self.variance[row], weigh)
         self.average.learn(np.where(used, update.log_density, 0.0))
         values = update.nis, update.believed, self.average.offset, self.average.drifting
         self.judged[:, row] = [self.average.mean(one) for one in values]
         return update
 
-    def _weigh(self, row: int, pair: Ints, innovation_m: Floats, variance_m2: Floats) -> WeighedInnovation:
+    def _weigh(self, row: int, innovation_m: Floats, variance_m2: Floats) -> WeighedInnovation:
         """Weigh innovations (filters, ...) by the gate, or by the error model."""
         update, robust = gated_update(innovation_m, variance_m2, self.gate), self.robust
-        if self.errors is not None:
-            used = self.uses[row][robust]
-            own = self.reflections.weigh(innovation_m[robust], variance_m2[robust], self.errors.at(row), pair, used)
+        if self.error_model is not None:
+            used, pair, errors = self.uses[row][robust], self.pair[row], self.error_model.at(row)
+            own = self.reflections.weigh(innovation_m[robust], variance_m2[robust], errors, pair, used)
             for name in ("noise_m", "variance_m2", "believed", "tail", "log_density"):
                 getattr(update, name)[robust] = getattr(own, name)
         return update
 
-    def pass_time(self, dt: float) -> None:
-        """Let delays drift, and the memory of reflections decay, for `dt` seconds."""
+    def pass_time(self, dt: float, *, same_exchange: bool) -> None:
+        """Let errors of pairs and the memory of reflections decay, and delays drift, for `dt` seconds.
+
+        Unless the next measurement is of the same exchange, it has another error of the exchange.
+        """
+        kept = np.where(self.of_pair, np.exp(-dt / self.lasting_s)[..., None], float(same_exchange))
+        self.running.decay(self.errors, kept)
         self.running.wander(dt)
         self.reflections.decay(dt)
 

@@ -10,7 +10,7 @@ body are only used as truth for evaluation.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import Any, Final
@@ -167,6 +167,27 @@ class _Readings(Measurements):
     patterns: list[list[EndPattern]]
     truth: Poses | None
     began_ns: int
+
+    def at_ns(self, seconds: Sequence[float]) -> Ints:
+        """Return host times of seconds since the first exchange (n,)."""
+        return self.began_ns + np.rint(np.array(seconds) * 1e9).astype(np.int64)
+
+    def true_poses(self, time_ns: Ints) -> tuple[Floats, Floats]:
+        """Return true positions (n, 3) and attitudes (n, 4) at some times, NaN without poses."""
+        if self.truth is None:
+            return np.full((len(time_ns), 3), np.nan), np.full((len(time_ns), 4), np.nan)
+        return bodies_m(self.truth, self.body, time_ns), nearest_attitude(self.truth, self.body, time_ns)
+
+    def used(self, settings: OnboardSettings) -> str:
+        """Return the kinds of readings that are used, in words."""
+        overheard = (self.measured.common_m > 0) | ((self.sign != 0).sum(axis=1) > 1)
+        used = {
+            "ranges": not overheard.all(),
+            "differences of arrival": overheard.any(),
+            "imu": settings.model == "imu",
+            "height": settings.height and len(self.height_s) > 0,
+        }
+        return ", ".join(name for name, there in used.items() if there)
 
 
 def _readings(data: Data, calibration: Calibration, settings: OnboardSettings) -> list[_Readings]:
@@ -365,28 +386,18 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         state = running.state[best, P], running.attitude[best, 0], running.covariance[best, P, P]
         states.append((now, *(part.copy() for part in state)))
 
-    def nanoseconds(seconds: Any) -> Ints:
-        return one.began_ns + np.rint(np.array(seconds) * 1e9).astype(np.int64)
-
+    delays, changes = known.delays.estimates(), running.changes
+    if running.drift[best]:
+        delays = known.delays.estimates(running.state[best, changes], running.covariance[best, changes, changes])
     times, places, attitudes, covariances = zip(*states, strict=True)
     heard_s, nis, accepted, drifts = zip(*updates, strict=True)
-    time_ns, place, covariance = nanoseconds(times), np.array(places), np.array(covariances)
-    truth, turned = np.full_like(place, np.nan), np.full((len(place), 4), np.nan)
-    if one.truth is not None:
-        truth = bodies_m(one.truth, one.body, time_ns)
-        turned = nearest_attitude(one.truth, one.body, time_ns)
-    overheard = (known.common_m > 0) | ((one.sign != 0).sum(axis=1) > 1)
-    used = {
-        "ranges": not overheard.all(),
-        "differences of arrival": overheard.any(),
-        "imu": settings.model == "imu",
-        "height": settings.height and len(one.height_s) > 0,
-    }
+    time_ns, place, covariance = one.at_ns(times), np.array(places), np.array(covariances)
+    truth, turned = one.true_poses(time_ns)
     return OnboardTrack(
         source=one.ranges.source,
         body=one.body,
         model=settings.model,
-        used=", ".join(name for name, there in used.items() if there),
+        used=one.used(settings),
         time_ns=time_ns,
         estimate_m=place,
         attitude=np.asarray(Rotation.from_matrix(np.array(attitudes)).as_quat()),
@@ -394,12 +405,12 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
         truth_m=truth,
         true_attitude=turned,
         nees=squared_over(place - truth, covariance),
-        range_time_ns=nanoseconds(heard_s),
+        range_time_ns=one.at_ns(heard_s),
         nis=np.array(nis),
         accepted=np.array(accepted),
         drifts=np.array(drifts),
         restarts_s=tuple(restarts),
-        delays=running.delays_at((best,), known.delays, drift=running.drift[best]),
+        delays=delays,
     )
 
 

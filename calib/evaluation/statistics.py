@@ -18,7 +18,6 @@ from calib.calibration.model import Calibration, CalibrationSource, given_calibr
 from calib.calibration.patterns import lack_direction, warn_of_directions
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_ranges
-from calib.pairs import pairs_of
 from calib.spread import TWO_SIDED_95, medians, robust_spread, spreads
 from uwblink.arrays import Bools, Floats, data_frame
 from uwblink.display import as_html
@@ -258,7 +257,7 @@ def planted_curve(ranges: Ranges, which: str, lifted: Floats) -> Floats | None:
 
 def pair_rows(ranges: Ranges) -> dict[str, Bools]:
     """Return which ranges belong to each pair of tags, whoever initiated."""
-    pairs = pairs_of(ranges.initiator, ranges.target)
+    pairs = ranges.pairs
     return {pair_name(ends): pairs.number == k for k, ends in enumerate(pairs.ends.tolist())}
 
 
@@ -270,7 +269,7 @@ def split_error(ranges: Ranges, error_m: Floats) -> ErrorSplit:
     DerSimonian and Laird 1986). Errors that last for seconds are treated as independent, so short sessions seem to
     differ. Groups of fewer than 5 ranges are left out.
     """
-    pair, count = pairs_of(ranges.initiator, ranges.target).number, int(ranges.session.max(initial=0)) + 1
+    pair, count = ranges.pairs.number, int(ranges.session.max(initial=0)) + 1
     codes, group, counts = np.unique(pair * count + ranges.session, return_inverse=True, return_counts=True)
     large = counts >= 5
     if not large.any():

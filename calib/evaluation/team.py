@@ -38,7 +38,7 @@ from calib.evaluation.filters import (
     without_directions,
 )
 from calib.evaluation.localization import Localization, consistency, delay_lines, delays_json, filter_ranges, fixed_std
-from calib.evaluation.models import FilterBank, FilterRanges
+from calib.evaluation.models import FilterBank, FilterRanges, ModelAverage
 from calib.evaluation.onboard import inertial_readings, mean_readings
 from calib.evaluation.tracking import Measurements, Settings, Track, ranges_among, used_part
 from calib.pairs import pairs_of
@@ -120,15 +120,14 @@ class RelativePose(Localization):
 class _Team(Measurements):
     """A recording: bodies with IMUs, the reference last, and measurements (n,) between them.
 
-    `body` (n, k, 2) and `arm` (n, k, 2, 3) are body and lever arm of the ends of distances. `shares` (n, k, 3) are the
-    states of shared errors: lasting and constant errors of pairs of tags, then errors of pairs of bodies. `readings`
-    are times in seconds and inertial readings of each body.
+    `body` (n, k, 2) and `arm` (n, k, 2, 3) are body and lever arm of the ends of distances, `sides` (n, k) the numbers
+    of their pairs of bodies. `readings` are times in seconds and inertial readings of each body.
     """
 
     bodies: list[str]
     body: Ints
     arm: Floats
-    shares: Ints
+    sides: Ints
     readings: list[tuple[Floats, Floats]]
     poses: Poses
 
@@ -250,15 +249,13 @@ def _team(ranges: Ranges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, A
                 f"{name}: inertial readings of {one} cover {time_s[0]:.1f} to {time_s[-1]:.1f} s after the first "
                 f"exchange, but the last exchange is at {last_s:.1f} s"
             )
-    pairs, of_bodies = found.pair, pairs_of(*np.moveaxis(body, 2, 0)).number
-    count = pairs.max() + 1
     return _Team(
         **found.to_dict(),
         ranges=ranges,
         bodies=bodies,
         body=body,
         arm=arms[found.ends],
-        shares=np.stack([pairs, count + pairs, 2 * count + of_bodies], axis=-1),
+        sides=pairs_of(*np.moveaxis(body, 2, 0)).number,
         readings=readings,
         poses=poses,
     )
@@ -278,7 +275,6 @@ def _start(team: _Team, settings: TeamSettings, filters: int) -> RelativeFilter:
     turn_std, noise = np.radians(settings.start_std_deg), settings.noise
     stds = settings.start_std_m, settings.start_std_m_s, turn_std, noise.gyro_start, noise.force_start
     spread = np.concatenate([np.tile(np.repeat(stds, 3), len(place)), np.repeat(stds[3:], 3)])
-    spread = np.append(spread, np.ones(team.shares.max() + 2))
     rng = np.random.default_rng([settings.seed, zlib.crc32(team.time_ns.tobytes())])
     place = place + rng.normal(size=place.shape) * settings.start_std_m
     attitude = attitude @ Rotation.from_rotvec(rng.normal(size=place.shape) * turn_std).as_matrix()
@@ -296,63 +292,39 @@ def _run(
 ) -> dict[str, dict[str, RelativeTrack]]:
     """Run filters on the measurements that each uses (n,); return the tracks of each body by filter.
 
-    States in addition to those of `RelativeFilter` are errors in units of their standard deviation: errors of pairs of
-    tags and of an exchange as in `run_filters`, and non-linear parts of distances by pairs of bodies.
+    States are those of `RelativeFilter`, non-linear parts of distances by pairs of bodies in units of their standard
+    deviation, and those of `FilterBank`.
     """
     # Raw ranges are not corrected, also not for patterns.
     raw = filters["dead reckoning"][0]
     corrected = np.array([one is not raw for one, _ in filters.values()])
     known, uses = [one for one, _ in filters.values()], np.stack([used for _, used in filters.values()], axis=1)
     running = _start(team, settings, len(known))
-    last = running.state.shape[1] - 1
-    bank = FilterBank(known, running, settings.gate, uses, last + 1)
-    average = bank.average
+    sides = running.append(np.eye(team.sides.max() + 1))
+    bank = FilterBank(known, running, settings.gate, uses, team.pair, team.sign)
     steps = np.arange(team.time_ns[0], team.time_ns[-1], round(1e9 / settings.rate_hz))
     time_ns = np.unique(np.concatenate([team.time_ns, steps]))
     time_s = (time_ns - time_ns[0]) * 1e-9
     inertial = np.stack([mean_readings(*one, time_s) for one in team.readings], axis=1)
-    firsts = np.append(np.searchsorted(team.time_ns, time_ns), len(team.rows))
+    firsts, elapsed_s = np.append(np.searchsorted(team.time_ns, time_ns), len(team.rows)), team.elapsed_s
     truth, turned = team.relative_poses(time_ns)
-    pose = BODY * np.arange(len(team.bodies) - 1)[:, None] + np.r_[P, A]
-    # Durations of shared errors: of pairs of tags; of pairs of bodies, 5 s, as errors of the state across the line of
-    # sight; of an exchange.
-    lasting = np.full((len(known), team.shares.max() + 2), np.inf)
-    lasting[:, team.shares[..., 2].min() : -1] = 5.0
-    lasting[:, : team.shares[..., 1].min()] = [[one.lasting_s] for one in known]
-    lasting[:, -1] = 1e-12
-    offset_m = np.array([one.offset_m for one in known])
-    shape = len(time_ns), len(average.shown), len(team.bodies) - 1
+    shape, same_exchange = (len(time_ns), len(bank.average.shown), len(team.bodies) - 1), team.same_exchange
     place, attitude, std_m, nees = np.empty((*shape, 3)), np.empty((*shape, 3, 3)), np.empty(shape), np.empty(shape)
-    exchange, last_s = -1, -1.0
     for k in range(len(time_ns)):
         if k:
             running.predict(time_s[k] - time_s[k - 1], inertial[k - 1, :-1], inertial[k - 1, -1])
         for row in range(firsts[k], firsts[k + 1]):
-            if team.exchange[row] != exchange:
-                # Two exchanges at the same time do not share an error, either.
-                kept = np.exp(-np.maximum(time_s[k] - last_s, 1e-9) / lasting)
-                running.decay(kept)
-                bank.pass_time(time_s[k] - max(last_s, 0.0))
-                exchange, last_s = team.exchange[row], time_s[k]
-            expected, slopes, bent_m = running.distances(team.body[row], team.arm[row], team.sign[row])
-            if patterns[row]:
-                geometry = team.body[row], team.arm[row], team.sign[row]
-                expected += corrected * running.longer_m(*geometry, patterns[row])
-            for which, (pair, offset, sides) in enumerate((running.known + team.shares[row]).tolist()):
-                slopes[:, pair] += bank.shared[row, :, which]
-                slopes[:, offset] += team.sign[row, which] * offset_m
-                slopes[:, sides] += team.sign[row, which] * bent_m[:, which]
-            slopes[:, last], slopes[:, bank.delays] = bank.common[row], bank.slopes[row]
-            bank.observe(row, slopes, expected, team.shares[row, :, 0])
-        # Attitudes are averaged as rotation vectors relative to the likeliest model.
-        bodies, likeliest = running.attitude[:, :-1], average.weights.argmax(axis=1)
-        away = Rotation.from_matrix((bodies[likeliest, None].swapaxes(-1, -2) @ bodies).reshape(-1, 3, 3)).as_rotvec()
-        places = np.broadcast_to(running.own[..., P], (len(likeliest), *running.own.shape[:2], 3))
-        state, covariance = average.moments(
-            np.concatenate([places, away.reshape(places.shape)], axis=-1),
-            running.covariance[:, pose[:, :, None], pose[:, None]],
-        )
-        place[k], attitude[k] = state[..., :3], bodies[likeliest] @ turned_by(state[..., 3:])
+            if not same_exchange[row]:
+                # Errors of the state across the line of sight last for 5 s.
+                running.decay(sides, np.exp([-elapsed_s[row] / 5.0]))
+                bank.pass_time(elapsed_s[row], same_exchange=False)
+            geometry = team.body[row], team.arm[row], team.sign[row]
+            expected, slopes, bent_m = running.distances(*geometry)
+            expected += corrected * running.longer_m(*geometry, patterns[row])
+            for which, side in enumerate(team.sides[row].tolist()):
+                slopes[:, sides.start + side] += team.sign[row, which] * bent_m[:, which]
+            bank.observe(row, slopes, expected)
+        place[k], attitude[k], covariance = _mean_poses(running, bank.average)
         turns = Rotation.from_matrix((attitude[k].swapaxes(2, 3) @ turned[k]).reshape(-1, 3, 3)).as_rotvec()
         wrong = np.concatenate([truth[k] - place[k], turns.reshape(place[k].shape)], axis=-1)
         nees[k] = squared_over(wrong, covariance)
@@ -372,6 +344,23 @@ def _run(
 
     names = [name for name, (one, _) in filters.items() if one.shown]
     return {body: {name: track(f, b) for f, name in enumerate(names)} for b, body in enumerate(team.bodies[:-1])}
+
+
+def _mean_poses(running: RelativeFilter, average: ModelAverage) -> tuple[Floats, Floats, Floats]:
+    """Return mean positions (shown, bodies, 3), attitudes (shown, bodies, 3, 3) and covariances of both (shown, bodies,
+    6, 6).
+
+    Attitudes are averaged as rotation vectors relative to those of the likeliest model.
+    """
+    bodies, likeliest = running.attitude[:, :-1], average.weights.argmax(axis=1)
+    away = Rotation.from_matrix((bodies[likeliest, None].swapaxes(-1, -2) @ bodies).reshape(-1, 3, 3)).as_rotvec()
+    places = np.broadcast_to(running.own[..., P], (len(likeliest), *running.own.shape[:2], 3))
+    pose = BODY * np.arange(running.bodies)[:, None] + np.r_[P, A]
+    state, covariance = average.moments(
+        np.concatenate([places, away.reshape(places.shape)], axis=-1),
+        running.covariance[:, pose[:, :, None], pose[:, None]],
+    )
+    return state[..., :3], bodies[likeliest] @ turned_by(state[..., 3:]), covariance
 
 
 def team_text(found: list[RelativePose], settings: TeamSettings) -> str:

@@ -168,6 +168,16 @@ class Measurements(ColumnTable):
         return pairs_of(*np.moveaxis(self.ends, 2, 0)).number
 
     @property
+    def elapsed_s(self) -> Floats:
+        """Time since the measurement before (n,)."""
+        return np.asarray(np.diff(self.time_ns, prepend=self.time_ns[:1]) * 1e-9)
+
+    @property
+    def same_exchange(self) -> Bools:
+        """Which measurements (n,) are of the same exchange as the one before."""
+        return np.asarray(np.diff(self.exchange, prepend=-1) == 0)
+
+    @property
     def heard(self) -> Bools:
         """Which measurements (n,) are differences of arrival."""
         return np.asarray((self.rows >= len(self.ranges)) | self.ranges.differences[self.exchange])
@@ -188,11 +198,6 @@ class Problem(Measurements):
     arm: Floats
     other: Floats
     known_m: Floats
-
-    @property
-    def elapsed_s(self) -> Floats:
-        """Time since the measurement before (n,)."""
-        return np.asarray(np.diff(self.time_ns, prepend=self.time_ns[:1]) * 1e-9)
 
     def velocity_spread(self, settings: Settings) -> Floats:
         """Return the variance that velocity noise adds per axis between measurements (n,), in square metres."""
@@ -272,7 +277,7 @@ def ranges_about(ranges: Ranges, tags: Sequence[int]) -> Ranges:
 
 def distances_in(ranges: Ranges) -> tuple[Ints, Floats, Ints]:
     """Return the tags (n, k, 2) and signs (n, k) of the distances in ranges and arrivals, and exchanges (n,)."""
-    ends, exchange, heard = np.column_stack([ranges.initiator, ranges.target]), np.arange(len(ranges)), ranges.arrivals
+    ends, exchange, heard = ranges.ends, np.arange(len(ranges)), ranges.arrivals
     if heard is None and not ranges.differences.any():
         return ends[:, None], np.ones((len(ranges), 1)), exchange
     listener = ranges.listener
@@ -296,43 +301,32 @@ def nearest_attitude(poses: Poses, body: str, time_ns: Ints) -> Floats:
 def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: Settings) -> dict[str, list[Track]]:
     """Run filters on the ranges of a body for each seed; return the tracks of each filter, one per seed.
 
-    A state is the position, for each pair of tags the error that its ranges share, in units of `shared_m`, the error
-    that measurements of one exchange share, in units of `common_m`, and for each pair its constant, in units of
-    `offset_m`; then the delays, which a restart keeps. Tracks are averages over a filter and its rivals. Arrays are
-    (filters, seeds, ...).
+    A state is the position, and those of `FilterBank`, of which a restart keeps the delays. Tracks are averages over a
+    filter and its rivals. Arrays are (filters, seeds, ...).
     """
-    count, known, pair, elapsed_s = len(problem), list(ranges.values()), problem.pair, problem.elapsed_s
+    count, known, elapsed_s, same = len(problem), list(ranges.values()), problem.elapsed_s, problem.same_exchange
     noises = [problem.noisy(settings, settings.seed + k) for k in range(settings.seeds)]
     moves, spread = np.stack([moves for _, moves in noises], axis=1), problem.velocity_spread(settings)
-    offset_m, pairs = np.array([one.offset_m for one in known]), 1 + int(pair.max())
-    moved, shape, size = moves.cumsum(axis=0), (len(known), settings.seeds), 4 + pairs * (2 if offset_m.any() else 1)
-    kept = np.empty((count, len(known), pairs + 1))
-    kept[..., :pairs] = np.exp(-elapsed_s[:, None, None] / [[one.lasting_s] for one in known])
-    kept[..., -1] = np.diff(problem.exchange, prepend=-1)[:, None] == 0
-    place, own = slice(0, 3), slice(size)
-    prior = np.diag(np.where(np.arange(size) < 3, settings.initial_std_m**2, 1.0))
-    running = GaussianFilters(np.zeros((*shape, size)), np.tile(prior, (*shape, 1, 1)), 3)
+    moved, shape, place = moves.cumsum(axis=0), (len(known), settings.seeds), slice(0, 3)
+    running = GaussianFilters(np.zeros((*shape, 3)), np.tile(settings.initial_std_m**2 * np.eye(3), (*shape, 1, 1)), 3)
     running.state[..., place] = [start for start, _ in noises]
-    bank = FilterBank(known, running, settings.gate, np.ones((count, len(known)), dtype=bool), pairs)
+    used = np.ones((count, len(known)), dtype=bool)
+    bank = FilterBank(known, running, settings.gate, used, problem.pair, problem.sign)
+    own = slice(running.changes.start)
+    prior = running.covariance[0, 0, own, own].copy()
     averaged = count, len(bank.average.shown), settings.seeds
     estimate, (std_m, nees) = np.empty((*averaged, 3)), np.empty((2, *averaged))
     # Twelve unexplained ranges at least, four for each coordinate, before a filter begins anew.
     explained_s, most_s = np.zeros(shape), settings.reopen_s / 2 / 12
     for k in range(count):
-        running.decay(kept[k][:, None])
         running.state[..., place] += moves[k]
         running.add_variance(place, spread[k])
-        bank.pass_time(elapsed_s[k])
+        bank.pass_time(elapsed_s[k], same_exchange=same[k])
         towards = running.state[..., None, place] + problem.arm[k] - problem.other[k]
         distance = np.linalg.norm(towards, axis=-1)
         h = np.zeros_like(running.state)
         h[..., place] = np.sum(towards * (problem.sign[k] / np.maximum(distance, 1e-6))[..., None], axis=-2)
-        for which, shares in enumerate((3 + pair[k]).tolist()):
-            h[..., shares] += bank.shared[k, :, which, None]
-            if size > 4 + pairs:
-                h[..., 1 + pairs + shares] += problem.sign[k, which] * offset_m[:, None]
-        h[..., 3 + pairs], h[..., bank.delays] = bank.common[k][:, None], bank.slopes[k][:, None]
-        update = bank.observe(k, h, problem.known_m[k] + distance @ problem.sign[k], pair[k])
+        update = bank.observe(k, h, problem.known_m[k] + distance @ problem.sign[k])
         lasted_s = min(elapsed_s[k], most_s)
         # A body with two others, one of them behind an obstacle, has reflections in half of its ranges: no reason to
         # restart.
@@ -342,7 +336,7 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
             rows = slice(np.searchsorted(problem.time_ns, problem.time_ns[k] - settings.reopen_s * 1e9), k + 1)
             # The body moved since these ranges: anchors are moved likewise.
             anchors = problem.other[rows] - problem.arm[rows] + (moved[k] - moved[rows])[:, lost[1], None]
-            known_m = problem.known_m[rows] + bank.slopes[rows, lost[0]] @ running.state[lost][bank.delays]
+            known_m = problem.known_m[rows] + bank.slopes[rows, lost[0], 0] @ running.state[lost][running.changes]
             fix = multilaterate(bank.measured[(rows, *lost)] - known_m, anchors, 0.0, sign=problem.sign[rows])
             state, covariance, explained_s[lost] = running.state[lost], running.covariance[lost], 0.0
             state[own], covariance[own], covariance[:, own], covariance[own, own] = 0.0, 0.0, 0.0, prior

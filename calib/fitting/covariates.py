@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -30,8 +30,9 @@ from calib.estimator.optimize import Optimum
 from calib.estimator.range_model import OFFSETS
 from calib.estimator.score_tests import Derivative, Family, Tested
 from calib.estimator.time_blocks import Persistence
+from calib.findings import REMEDIES, Finding, warning
 from calib.settings import FitSettings
-from calib.spread import TWO_SIDED_95, robust_spread
+from calib.spread import TWO_SIDED_95, robust_spread, students_factor
 from uwblink.arrays import Floats
 from uwblink.display import first_few
 
@@ -48,32 +49,35 @@ RANGES_AN_UNKNOWN = 10
 MISSING = {
     "pattern": (
         "no directions are known; a pattern needs poses with attitudes (`uwblink poses`)",
-        "attitudes vary too little to separate a pattern of the antenna from errors that depend on places; record a "
-        "flight in which the robot makes a full turn at several places",
+        "attitudes vary too little to separate a pattern of the antenna from errors that depend on places",
+        "undetermined pattern over direction",
     ),
     "temperature": (
         "no temperatures are known; a slope needs temperature readings of tags within 30 s of ranges",
-        "temperatures vary too little to estimate their effect on ranges; record while the boards warm up",
+        "temperatures vary too little to estimate their effect on ranges",
+        "undetermined slope over temperature",
     ),
 }
-"""What ranges lack that determine no dependence, by setting: values at all, and values that differ enough."""
+"""What ranges lack that determine no dependence, by setting: values at all, and values that differ enough; and the name
+of the latter among `REMEDIES`."""
 
 PASSES_FOR_POWER = (
+    "pattern or effect of power",
     "the pattern over direction may be an effect of power: errors of single tags that depend on power explain the "
-    "data as well; compare with a fit with `pattern` none and `groups` of tags"
+    "data as well",
 )
 
 
 def fit_with_covariates(
     ranges: Ranges, settings: FitSettings
-) -> tuple[KnownDistances, dict[str, dict[str, Any]], list[str]]:
-    """Return the fit with the dependences that `settings` ask for, what to remember of them by setting, and warnings.
+) -> tuple[KnownDistances, dict[str, dict[str, Any]], list[Finding]]:
+    """Return the fit with the dependences that `settings` ask for, what to remember of them by setting, and findings.
 
     Raises `UnanswerableError` where one is asked for that the data do not determine, and what `fit_known_distances`
     raises.
     """
     found = fit_known_distances(ranges, replace(settings, pattern="none", temperature="none"))
-    told, warnings = dict[str, dict[str, Any]](), list[str]()
+    told, findings = dict[str, dict[str, Any]](), list[Finding]()
     # Without the pattern of a robot that turns slowly, a slope is too uncertain: it is asked for again beside one.
     for name in (*COVARIATES, "temperature"):
         asked, before = getattr(settings, name), told.get(name, {})
@@ -83,15 +87,15 @@ def fit_with_covariates(
             continue
         found, kept, more = _with(name, asked, found, ranges)
         told |= {name: kept} if kept else {}
-        warnings += more
-    return found, told, warnings
+        findings += more
+    return found, told, findings
 
 
 def _with(
     name: str, asked: str, plain: KnownDistances, ranges: Ranges
-) -> tuple[KnownDistances, dict[str, Any], list[str]]:
+) -> tuple[KnownDistances, dict[str, Any], list[Finding]]:
     """Return a fit with the dependence `name` beside those of a `plain` fit, if there is evidence or it is `asked`."""
-    model, nothing = plain.model, (plain, dict[str, Any](), list[str]())
+    model, nothing = plain.model, (plain, dict[str, Any](), list[Finding]())
     covariate = COVARIATES[name][0](model.ranges)
     kinds = {"shared": COMMON, "tag": OWN} if name == "pattern" else {"shared": WARMTH, "tag": OWN_WARMTH}
     changes: dict[str, dict[str, Any]] = {mode: {name: mode} for mode in kinds}
@@ -105,9 +109,9 @@ def _with(
         if asked != "auto":
             raise UnanswerableError(f"{ranges.source}: {why}", parameter=name)
         return plain, _not_fitted(name, covariate, why.rpartition(": ")[2].partition(";")[0]), []
-    warnings = [f"tags {first_few(map(str, vague))}: {MISSING[name][1]}"] if vague else []
+    unclear = [warning(MISSING[name][2], f"tags {first_few(map(str, vague))}: {MISSING[name][1]}")] if vague else []
     if asked != "auto":
-        return fit_known_distances(ranges, replace(model.settings, **changes[asked])), {"kind": asked}, warnings
+        return fit_known_distances(ranges, replace(model.settings, **changes[asked])), {"kind": asked}, unclear
     # A drift of many times the noise passes for reflections where it is not fitted.
     if name == "pattern" and max(map(log_evidence, tested)) < LOG_EVIDENCE:
         return nothing
@@ -126,7 +130,7 @@ def _with(
         if evidence >= LOG_EVIDENCE and marginal > likeliest:
             explained = name == "pattern" and log_evidence(_beside_power(plain, covariate, kind)) < LOG_EVIDENCE
             known = {"kind": mode, "log_evidence": round(evidence, 1)}
-            best, likeliest = (found, known, [PASSES_FOR_POWER] * explained), marginal
+            best, likeliest = (found, known, [warning(*PASSES_FOR_POWER)] * explained), marginal
         # Slopes of tags are about a common one: what speaks against that speaks against them, too.
         beside = min(evidence, 0.0) * (name == "temperature")
     if best is nothing:
@@ -134,21 +138,21 @@ def _with(
     return best
 
 
-def supply_warnings(slopes: Sequence[TemperatureSlope], ranges: Ranges) -> list[str]:
-    """Return a warning for each slope over temperature that a supply which changed with it may have moved by more than
+def effects_of_supply(slopes: Sequence[TemperatureSlope], ranges: Ranges) -> Iterator[Finding]:
+    """Yield a finding for each slope over temperature that a supply which changed with it may have moved by more than
     a standard error."""
-    changes, said = dict(ranges.supply_v_per_k), []
+    changes = dict(ranges.supply_v_per_k)
     for one in slopes:
         known = [changes[tag] for tag in one.tags if tag in changes]
         # A range grows by 5.35 cm/V with the supply of a tag (DW1000 user manual, section 8.3.1).
         moved = 0.0535 * float(np.mean(known)) if known else 0.0
         if abs(moved) > one.std_m_per_k:
-            said.append(
+            yield warning(
+                "supply voltage",
                 f"tags {first_few(map(str, one.tags))}: their supply voltage changes by {1e3 * np.mean(known):+.1f} "
                 f"mV/K, which may cause {1e3 * moved:+.2f} mm/K of their slope over temperature (5.35 cm/V: DW1000 "
-                "user manual); keep the supply constant while boards warm up"
+                "user manual)",
             )
-    return said
 
 
 def _as_lasting(tested: Tested, known: Persistence) -> Tested:
@@ -157,7 +161,7 @@ def _as_lasting(tested: Tested, known: Persistence) -> Tested:
     Alternatives that follow a pattern differ from block to block, and the errors in their sums last less.
     """
     longest = max(known, tested.lasting, key=lambda one: one.factor)
-    factor = longest.factor / tested.lasting.factor * (known.quantile95 / TWO_SIDED_95) ** 2
+    factor = longest.factor / tested.lasting.factor * students_factor(known.freedom) ** 2
     return replace(tested, covariance=factor * tested.covariance, lasting=longest)
 
 
@@ -171,9 +175,8 @@ def _beside_power(plain: KnownDistances, covariate: Covariate, kind: str) -> Tes
     names, columns, values = covariate.entries(kind, plain.model.pairs)
     tags, pairs, count = plain.model.tags, plain.model.pairs, len(values)
     rank = np.linspace(-1, 1, count)[np.argsort(np.argsort(plain.model.lifted, kind="stable"))]
-    ends = np.searchsorted(tags, pairs.ends)[pairs.number] + len(names)
     derivative = Derivative(
-        np.concatenate([columns, ends], axis=1),
+        np.concatenate([columns, pairs.among(tags) + len(names)], axis=1),
         np.concatenate([-values, rank[:, None], rank[:, None]], axis=1),
         len(names) + len(tags),
     )
@@ -188,18 +191,17 @@ def with_new_tag(calibration: Calibration, tag: int, ranges: Ranges) -> Calibrat
     others share, if errors scatter less with it; else one that is unknown and as large as theirs, so that total sigmas
     contain it.
     """
-    if np.isfinite(ranges.temperature_c[np.column_stack([ranges.initiator, ranges.target]) == tag]).all():
+    if np.isfinite(ranges.temperature_c[ranges.ends == tag]).all():
         slopes = [replace(o, tags=(*o.tags, tag)) if len(o.tags) > 1 else o for o in calibration.temperatures]
         calibration = replace(calibration, temperatures=tuple(slopes))
     patterns = calibration.patterns
     if tag not in ranges.turning or not patterns:
         return calibration
-    ends = np.stack([ranges.initiator, ranges.target], axis=1)
     variance = np.mean([np.square(one.coefficients_m) + np.diag(one.covariance_m2) for one in patterns])
     unknown = Pattern(
         tags=(tag,),
         coefficients_m=(0.0,) * HARMONICS,
-        centre=tuple(np.nanmean(harmonics(ranges.toward[ends == tag]), axis=0).tolist()),
+        centre=tuple(np.nanmean(harmonics(ranges.toward[ranges.ends == tag]), axis=0).tolist()),
         covariance_m2=tuple(map(tuple, (variance * np.eye(HARMONICS)).tolist())),
         rms_m=math.sqrt(np.mean([one.rms_m**2 for one in patterns])),
     )
@@ -275,7 +277,8 @@ def _why(name: str, covariate: Covariate, ranges: Ranges, needed: int) -> str:
     if not known.any():
         return MISSING[name][0]
     still = "" if covariate.tags else f"no body turns by more than {math.degrees(LEAST_TURN_RAD):.0f}° of "
-    return f"{still}tags {first_few(map(str, covariate.tags or ranges.tags()))}: {MISSING[name][1]}"
+    what = f"{MISSING[name][1]}; {REMEDIES[MISSING[name][2]]}"
+    return f"{still}tags {first_few(map(str, covariate.tags or ranges.tags()))}: {what}"
 
 
 def drift_of(found: KnownDistances) -> dict[str, Any]:
@@ -290,8 +293,7 @@ def drift_of(found: KnownDistances) -> dict[str, Any]:
     fitted = layout.indices(["offset of tag in session"])
     if not (len(fitted) and of_host_clock(int(ranges.time_ns.min()))):
         return {}
-    ends = np.searchsorted(tags, pairs.ends)[pairs.number]
-    offsets = Derivative(ends * count + ranges.session[:, None], np.ones((1, 1)), len(tags) * count)
+    offsets = Derivative(pairs.among(tags) * count + ranges.session[:, None], np.ones((1, 1)), len(tags) * count)
     tested = found.slopes.test(Family(kind="session", names=(), derivative=offsets, fitted=fitted))
     # What lasts within a session is in the offsets of its pairs, whose variance the information contains.
     tested = replace(tested, total=tested.total + tested.pulled, covariance=0.0 * tested.covariance)

@@ -1,4 +1,4 @@
-"""`calib.fit` and `calib.add_tag`: from settings and ranges to a calibration with warnings.
+"""`calib.fit` and `calib.add_tag`: from settings and ranges to a calibration with findings.
 
 A constant of the curve and a common shift of all delays cannot be distinguished (docs/theory.md). Delays are therefore
 stated for a curve that is zero at a reference power: the same boards then get the same delays whatever powers a
@@ -8,7 +8,7 @@ recording holds.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -22,14 +22,14 @@ from calib.calibration.model import Calibration, CalibrationSource, given_calibr
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import (
     WITHOUT_CURVE,
+    dependence_on_initiator,
+    doubts_about_data,
     implausible_values,
-    initiator_warning,
-    limit_warnings,
-    power_level_warning,
+    limits,
     refuse_contradicted,
     refuse_impossible,
     refuse_refuted,
-    warnings_of,
+    unlike_power_levels,
 )
 from calib.data.ranges import Ranges, held_out
 from calib.data.sources import Data, load_ranges, require_arrivals
@@ -38,7 +38,8 @@ from calib.estimator.known_distances import KnownDistances
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
-from calib.fitting.covariates import drift_of, fit_with_covariates, supply_warnings, with_new_tag
+from calib.findings import Finding, for_provenance, warning
+from calib.fitting.covariates import drift_of, effects_of_supply, fit_with_covariates, with_new_tag
 from calib.fitting.passive_listeners import MIN_OF_DELAY
 from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings, check_tag
@@ -52,7 +53,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     `data` is what `load_ranges` takes: paths of recordings, simulations in memory, `Ranges`, one or several. `settings`
     and keyword arguments named like its fields select the model and its options (see `FitSettings`).
 
-    `warnings` begin with what a fit of the chosen kind cannot know: without a curve (`delays_only`), with taken delays
+    Findings begin with what a fit of the chosen kind cannot know: without a curve (`delays_only`), with taken delays
     (`delays_from`), with constants by pair (`constants`). Where power never changes the curve is flat.
 
     Where tags range only with tags of another side (anchors with robots), a warning says so, and the calibration
@@ -109,12 +110,14 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         settings=settings,
         fixed=fixed,
         first=[
-            f"{unused} differences of arrival at other tags would determine the delays of targets: fit with `use` "
-            f"receptions"
+            warning(
+                "unused differences of arrival",
+                f"{unused} differences of arrival at other tags would determine the delays of targets",
+            )
         ]
         if unused
         else [],
-        more=[*vague, *supply_warnings(calibration.temperatures, ranges), *_convergence_warnings(found, settings.loss)],
+        more=[*vague, *effects_of_supply(calibration.temperatures, ranges), *_convergence(found, settings.loss)],
     )
     return replace(result, held_out=held)
 
@@ -168,9 +171,10 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
     )
     found = fit(straight, settings, lift=calibration.lift)
     added = {"tag": tag, "recording": ranges.source, "exchanges": len(some)}
-    unshared = (
+    unshared = warning(
+        "pattern of another tag",
         f"tag {tag}: its pattern over direction differs from those of the other tags and is not known: total sigmas "
-        f"include a pattern of the same size; fit all recordings together to estimate it"
+        f"include a pattern of the same size",
     )
     return replace(
         found,
@@ -184,8 +188,8 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
         ),
         ranges=some,
         # The curve is known, and was taken off before.
-        warnings=[
-            *[text for text in found.warnings if not text.startswith(WITHOUT_CURVE)],
+        findings=[
+            *[one for one in found.findings if one.fault != WITHOUT_CURVE],
             *([unshared] if len(joined.patterns) > len(calibration.patterns) else []),
         ],
     )
@@ -221,7 +225,7 @@ def _ranges_of_new_tag(calibration: Calibration, tag: int, ranges: Ranges) -> Ra
             f"{MIN_OF_DELAY} are needed"
         )
     directed = [one for pattern in calibration.patterns for one in pattern.tags]
-    blind = np.isnan(some.toward).any(axis=2) & np.isin(np.stack([some.initiator, some.target], axis=1), directed)
+    blind = np.isnan(some.toward).any(axis=2) & np.isin(some.ends, directed)
     some = some[np.flatnonzero(~blind.any(axis=1))]
     if len(some) < MIN_OF_DELAY:
         raise UnanswerableError(
@@ -283,39 +287,40 @@ def result_of(
     found: KnownDistances,
     calibration: Calibration,
     ranges: Ranges,
-    findings: Iterable[str],
+    findings: Iterable[Finding],
     *,
     settings: FitSettings,
     fixed: Mapping[int, float],
-    first: Iterable[str] = (),
-    more: Iterable[str] = (),
+    first: Iterable[Finding] = (),
+    more: Iterable[Finding] = (),
 ) -> FitResult:
-    """Return the result of a fit: its calibration with lasting errors, warnings and provenance, and the residuals.
+    """Return the result of a fit: its calibration with lasting errors, findings and provenance, and the residuals.
 
-    `findings` are sentences of the checks of the fit; the warnings of a kind of fit are `first`, or `more` after the
-    limits of the ranges.
+    `findings` are those of the checks of the fit; those of a kind of fit are `first`, or `more` after the limits of the
+    ranges.
     """
     applied = calibration.apply(ranges)
     residuals = applied.corrected_m - ranges.truth_m
     over_sigma = residuals / applied.sigma_m
     inliers: Bools = np.asarray(np.abs(over_sigma) < 3.0)
-    findings = [*findings, *initiator_warning(ranges)]
+    findings = [*findings, *dependence_on_initiator(ranges)]
     refuse_contradicted(float(np.mean(inliers)), ranges, findings)
     if calibration.errors is not None:
         known = replace(
             calibration.errors, lasting=lasting_errors(ranges, over_sigma, applied.tail_share, applied.tail_probability)
         )
         calibration = replace(calibration, errors=known)
-    warnings = [
-        *([split_text(calibration.undetermined_splits)] if calibration.undetermined_splits else []),
+    splits = calibration.undetermined_splits
+    findings = [
+        *([warning("undetermined delays", split_text(splits))] if splits else []),
         *first,
-        *limit_warnings(found, ranges, residuals, fixed),
+        *limits(found, ranges, residuals, fixed),
         *more,
         *findings,
         *implausible_values(calibration.delays_ns, residuals),
-        *power_level_warning(ranges, calibration),
-        *_reference_power_warning(found),
-        *warnings_of(ranges, float(np.mean(inliers)), found.blocks.seconds),
+        *unlike_power_levels(ranges, calibration),
+        *_without_reference_power(found),
+        *doubts_about_data(ranges, float(np.mean(inliers)), found.blocks.seconds),
     ]
     provenance: dict[str, Any] = {
         "writer": f"uwbcal {uwblink.__version__}",
@@ -324,8 +329,8 @@ def result_of(
         "excluded": ranges.excluded,
         "converged": found.success,
         "standard_errors": f"sandwich over {found.persistence.stretches:.0f} independent stretches of time",
-        "warnings": warnings,
-        "error_std_m": {"raw": float(np.std(ranges.raw_m - ranges.truth_m)), "corrected": float(np.std(residuals))},
+        **for_provenance(findings),
+        "error_std_m": {"raw": float(np.std(ranges.error_m)), "corrected": float(np.std(residuals))},
     }
     if fixed:
         provenance["fixed_ns"] = {str(tag): delay for tag, delay in sorted(fixed.items())}
@@ -338,7 +343,7 @@ def result_of(
         inliers=inliers,
         success=found.success,
         message=f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
-        warnings=warnings,
+        findings=findings,
     )
 
 
@@ -372,30 +377,27 @@ def _evaluate_held_out(held: HeldOut, settings: FitSettings) -> dict[str, Any]:
     return {name: for_json(value) for name, value in judged.items()}
 
 
-def _convergence_warnings(found: KnownDistances, asked_for: str | None) -> list[str]:
+def _convergence(found: KnownDistances, asked_for: str | None) -> Iterator[Finding]:
     if asked_for == MIXTURE and found.searches[0].loss != MIXTURE:
-        return [
-            "the likelihood treated all ranges of a pair as reflected, so a robust loss was fitted instead: "
-            "compare with other losses"
-        ]
-    if found.success:
-        return []
-    return [f"the fit stopped after {found.steps} steps before it converged: delays and intervals are not final"]
+        text = "the likelihood treated all ranges of a pair as reflected, so a robust loss was fitted instead"
+        yield warning("another loss", text)
+    elif not found.success:
+        text = f"the fit stopped after {found.steps} steps before it converged: delays and intervals are not final"
+        yield warning("not converged", text)
 
 
-def _reference_power_warning(found: KnownDistances) -> list[str]:
-    """Return a warning if no range has the reference power, so that delays are stated at the nearest power."""
+def _without_reference_power(found: KnownDistances) -> Iterator[Finding]:
+    """Yield a finding if no range has the reference power, so that delays are stated at the nearest power."""
     model, settings = found.model, found.model.settings
     if model.reference is None or not _has_gauge(found):
-        return []
+        return
     near = float(np.clip(model.reference, *model.span))
-    if near == model.reference:
-        return []
-    return [
-        f"no ranges at the reference power of {model.reference_dbm:.1f} dBm: delays refer to the nearest recorded "
-        f"power, {settings.alpha_dbm + 10 * np.log10(near):.1f} dBm, and can only be compared with delays at the "
-        f"same power"
-    ]
+    if near != model.reference:
+        yield warning(
+            "reference power",
+            f"no ranges at the reference power of {model.reference_dbm:.1f} dBm: delays refer to the nearest recorded "
+            f"power, {settings.alpha_dbm + 10 * np.log10(near):.1f} dBm",
+        )
 
 
 def _has_gauge(found: KnownDistances) -> bool:

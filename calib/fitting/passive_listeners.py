@@ -44,7 +44,7 @@ def heard_delays(data: Data, calibration: Calibration) -> dict[int, OverheardDel
     ranges = Ranges.from_exchanges(exchanges, poses=poses, tags=tags, source=name)
     arrivals = arrivals_of(exchanges, ranges.raw_m, heard, poses, tags)
     bias_m = reception_bias_m(calibration, heard_receptions(replace(ranges, arrivals=arrivals)))
-    target, of_range = ranges.target[arrivals.exchange], (ranges.raw_m - ranges.truth_m)[arrivals.exchange]
+    target, of_range = ranges.target[arrivals.exchange], ranges.error_m[arrivals.exchange]
     error_m = arrivals.error_m + of_range - bias_m
     found = {}
     for tag in np.unique(target).tolist():

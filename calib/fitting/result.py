@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import calib
 from calib.calibration.model import Calibration, CalibrationResult
 from calib.data.ranges import Ranges
+from calib.findings import Finding
 from uwblink.arrays import Bools, Floats
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ class FitResult(CalibrationResult):
     """The result of `fit`: a calibration with its warnings, residuals and figures.
 
     `ranges` are those that were fitted (n,), `residuals_m` their fully corrected errors, corrected range less truth;
-    `inliers` those within three sigmas. `message` states how the search ended; `warnings` are the known limits and
+    `inliers` those within three sigmas. `message` states how the search ended; `findings` are known limits and
     doubts, the most serious first. `held_out` is there if `FitSettings.hold_out` asked for it. The `plot_` methods draw
     into matplotlib axes, new ones if none are given, and return them.
 
@@ -45,7 +46,7 @@ class FitResult(CalibrationResult):
     inliers: Bools
     success: bool
     message: str
-    warnings: list[str]
+    findings: list[Finding]
     held_out: HeldOut | None = None
 
     def headline(self) -> str:

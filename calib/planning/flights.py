@@ -141,7 +141,7 @@ def flight_of(
 class Information:
     """The information on a flight's unknowns at its planned trajectories.
 
-    `covariance_ns2` (tags, tags) is that of the delays of `tags`, `verdict` says which of them are determined.
+    `covariance_ns2` (tags, tags) is the covariance of the delays of `tags`; `verdict` states which are determined.
     """
 
     def __init__(self, flight: PlannedFlight) -> None:
@@ -158,7 +158,7 @@ class Information:
         knots = np.zeros(0) if model.curve is None else model.curve.knots
         for kind in model.curve_kinds():
             centres = np.convolve(knots[1:-1], np.full(3, 1 / 3), mode="valid")
-            # A typical bias curve, of 5 cm and 3 rad over the range of powers: it sets the smoothness that a fit finds.
+            # A typical bias curve has 5 cm and 3 rad over the range of powers; it determines the estimated smoothness.
             self.x[self.layout.where[kind]] = 0.05 * np.sin(3.0 * centres)
         geometry = Distances.of(self.motion, self.layout, (model.ranges.initiator, model.ranges.target), scene.time_s)
         raw = np.zeros(len(scene.time_s))
@@ -194,13 +194,13 @@ class Information:
         np.add.at(rows, (tapes.number[:, None], geometry.columns), moved)
         reach = self.covariance @ rows.T
         gain = np.sum(reach[self.delays] ** 2, axis=0) / (np.einsum("kp,pk->k", rows, reach) + sigma_m**2)
-        # Rounded, so that of equal pairs every machine takes the first.
+        # Gains are rounded, so that every machine chooses the first of equal pairs.
         return pairs[int(np.argmax(np.round(gain, 9)))]
 
 
 def _jerk(points: Floats, step_s: float) -> float:
-    """Return the jerk that paths by control points (k, bodies, 3) have, root mean square, away from their ends."""
-    # Planned positions do not determine four control points at either end well.
+    """Return the root mean square jerk of paths with control points (k, bodies, 3), without their ends."""
+    # Planned positions hardly determine the four control points at either end.
     inner = points[4:-4] if len(points) > 12 else points
     jerk = np.diff(inner, n=3, axis=0) / step_s**3
     return max(float(np.sqrt(np.mean(jerk**2))), LEAST_JERK)
@@ -212,11 +212,12 @@ Robots = int | Sequence[Sequence[int]]
 def plan_flight(robots: Robots | Data, settings: FlightPlanSettings | None = None, **changes: Any) -> FlightPlan:
     """Plan a flight for `fit_from_ranges`: the expected accuracy of the delays, and the gain of further measurements.
 
-    `robots` is how many there are, with two tags each, or the ids of the tags of each; or a recording of a flight with
-    poses all along (a simulated one, or an earlier one), from which motion, lever arms and powers are taken. `settings`
-    and keyword arguments named like its fields (`FlightPlanSettings`, which explains them) say what will be measured.
+    `robots` is the number of robots with two tags each, or the ids of the tags of each; or a recording of a flight
+    with poses throughout (simulated, or an earlier flight), which gives motion, lever arms and powers. `settings` and
+    keyword arguments named like its fields (`FlightPlanSettings`, which explains them) state what will be measured.
 
-    Raises `BadInputError` for what cannot be, and `UnanswerableError` for a recording that no fit could use.
+    Raises `BadInputError` for impossible robots or settings, and `UnanswerableError` for a recording that no fit could
+    use.
 
     >>> import calib
     >>> plan = calib.plan_flight(3, seconds=20.0)
@@ -253,11 +254,13 @@ def plan_flight(robots: Robots | Data, settings: FlightPlanSettings | None = Non
 
 
 def _information(asked: FlightPlanSettings, data: Data | None) -> Information:
-    """Return that of a recorded flight, or of robots that fly about a room, with as many tapes as are asked for."""
+    """Return the information of a recorded flight, or of robots that fly in a room, with the requested number of taped
+    distances.
+    """
     force_std_m_s2 = (
         None
         if asked.imu is None
-        # The second part is vibration that is left in a mean (m/s^2): a judgement; a fit weighs by its residuals.
+        # The second part is the vibration that a mean retains (m/s^2): a judgement, because a fit weights by residuals.
         else TRUSTED * math.hypot(IMUS[asked.imu].force / math.sqrt(SAMPLE_S), 0.2)
     )
     flight = flight_of(
@@ -286,7 +289,7 @@ def _information(asked: FlightPlanSettings, data: Data | None) -> Information:
 
 
 def _mean_ns(covariance: Floats) -> float:
-    """Return the root mean square half interval, where each delay has the prior of a guess."""
+    """Return the root mean square half interval of the delays with the prior of `mean_std_ns`."""
     return TWO_SIDED_95 * mean_std_ns(np.asarray(np.linalg.pinv(covariance, hermitian=True), np.float64))
 
 
@@ -311,12 +314,12 @@ def _more(asked: FlightPlanSettings, data: Data | None, found: Information) -> I
 
 
 def _changes(asked: FlightPlanSettings, flight: PlannedFlight) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield further measurements in words, with the changes of the settings that they are.
+    """Yield additional measurements in words, with the changed settings.
 
-    The words have places for both tags of the last taped distance.
+    The words have fields for both tags of the last taped distance.
     """
-    # Seconds at a stand, anchors and degrees of error of headings that a team can have without other equipment, beside
-    # ten more seconds of known positions.
+    # Standstill, number of anchors and error of headings that a team can achieve without other equipment, and ten more
+    # seconds of known positions.
     stands_s, more_anchors, heading_deg = 5.0, 4, 0.5
     longer, poses = (asked.poses_until_s or 0.0) + 10.0, asked.attitudes == "poses"
     free, given = asked.robots is not None, {"anchor_places": "given"}

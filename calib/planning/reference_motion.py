@@ -1,4 +1,4 @@
-"""A reference flight for a plan: bodies on sums of sines in a room, ranging in turn, without errors."""
+"""A reference flight for a plan: bodies move on sums of sines in a room and range in turn, without errors."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ def _ns(time_s: Floats) -> Ints:
 
 
 def _motion(flown: FlightPlanSettings, number: int, rng: np.random.Generator) -> BSpline:
-    """Return position and yaw (4,) of a body over time: two sines an axis about a middle of its own, upright, turning
-    to and fro.
+    """Return position and yaw (4,) of a body over time: two sines per axis about its own centre, upright, turning left
+    and right.
 
-    Until it starts it stands; 3 s later it is as fast as it will be: a judgement, gentle at 1 m/s.
+    The body stands still, starts, and has its full speed 3 s later: a judgement, a gentle start at 1 m/s.
     """
     size, angle = np.array(flown.size_m), 2 * np.pi * number / len(flown.robots) + 0.4
-    # Middles lie on an ellipse of 0.3 of the room; each of the two sines is 0.12 of it.
+    # Centres lie on an ellipse of 0.3 of the room; each of the two sines is 0.12 of it.
     middle = size * (0.5 + 0.3 * np.array([np.cos(angle), np.sin(angle), 0.0]))
     reach = 0.12 * size
     slow = 2 * np.pi * float(np.linalg.norm(reach)) / flown.speed_m_s
@@ -77,7 +77,7 @@ def _arms(count: int, apart_m: float) -> Floats:
 
 
 def _corners(flown: FlightPlanSettings) -> Floats:
-    """Return places of anchors (n, 3) around the room, at 5 % and 95 % of its height in turn."""
+    """Return the positions of anchors (n, 3) around the room, at 5 % and 95 % of its height in turn."""
     number = np.arange(len(flown.anchors))
     angle = 2 * np.pi * number / max(len(number), 1) + np.pi / 4
     around = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -86,7 +86,7 @@ def _corners(flown: FlightPlanSettings) -> Floats:
 
 
 def _in_turn(flown: FlightPlanSettings, count: int, rng: np.random.Generator) -> Ints:
-    """Return who ranges with whom (n, 2): all pairs of bodies but two anchors, each round in another order."""
+    """Return the tags (n, 2) of the ranges: all pairs on different bodies but two anchors, each round in another order."""
     body = {tag: k for k, robot in enumerate(flown.robots) for tag in robot}
     pairs = [
         *((a, b) for a, b in combinations(body, 2) if body[a] != body[b]),
@@ -97,7 +97,7 @@ def _in_turn(flown: FlightPlanSettings, count: int, rng: np.random.Generator) ->
 
 
 def _poses(flown: FlightPlanSettings, bodies: Mapping[str, BSpline]) -> Poses:
-    """Return the poses of all bodies, those of anchors at the first and the last instant."""
+    """Return the poses of all bodies; anchors have one at the start and one at the end."""
     time = np.arange(-1.0, flown.seconds + 1.0, 0.05)
     rows = [
         *((name, time, motion(time)) for name, motion in bodies.items()),

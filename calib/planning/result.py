@@ -16,19 +16,22 @@ from uwblink.arrays import Floats
 
 
 def mean_std_ns(information: Floats) -> float:
-    """Return the root mean variance of delays, ns, from what data tell of them (tags, tags), 1/ns^2, beside the guess.
+    """Return the root mean square standard error of delays, ns, from the information of data (tags, tags), 1/ns^2, and
+    of a prior.
 
-    Rounded, so that mirror images are equally good on every machine and the first of them is taken.
+    The result is rounded, so that mirror images are equally good on every machine, and the first of them is chosen.
     """
-    # The guess is two and a half times what published delays differ by (0.6 ns): means are finite then, though some
-    # delays are not determined.
+    # The prior's standard deviation is 2.5 times the differences of published delays (0.6 ns); with it the mean is
+    # finite even if some delays are not determined.
     whole = information + np.eye(len(information)) / 1.5**2
     return round(float(np.sqrt(np.trace(np.linalg.inv(whole)) / len(whole))), 8)
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedArrangement:
-    """One arrangement: its name, where about the boards stand (metres, by tag), and distances to tape, by pairs."""
+    """An arrangement: its name, approximate positions of the boards (metres, by tag), and pairs whose distance is to be
+    measured with a tape.
+    """
 
     name: str
     place_m: Mapping[int, tuple[float, float, float]]
@@ -49,9 +52,9 @@ class PlannedArrangement:
 
 @dataclass(frozen=True, slots=True)
 class NextBest:
-    """What one more measurement would bring: what it is, and the mean half interval (ns) it leaves, of how much.
+    """An additional measurement, and the mean half intervals (ns) with it (`mean_ns`) and without it.
 
-    Of a delay that nothing determines 1.5 ns are taken for known.
+    An undetermined delay counts with a standard error of 1.5 ns.
     """
 
     what: str
@@ -61,9 +64,10 @@ class NextBest:
 
 @dataclass(frozen=True, slots=True)
 class Precision(Generic[Value]):
-    """Precision of delays in ns, infinite where undetermined: of each, of each against the mean of all, of that mean.
+    """Precision of delays in ns: of each, of each relative to the mean of all, and of that mean; infinite if
+    undetermined.
 
-    They are standard deviations or half intervals, of delays as arrays (tags,) or as root mean squares.
+    The values are standard deviations or half intervals; those of delays are arrays (tags,) or root mean squares.
     """
 
     each: Value
@@ -73,11 +77,11 @@ class Precision(Generic[Value]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Plan:
-    """What plans of both kinds say: half an interval of 95 % of each delay (ns), infinite where it stays open.
+    """The base of both kinds of plans: half 95 % intervals of the delays (ns), infinite for undetermined ones.
 
-    `open_ns` may have half an interval of those that stay open as well. `common_ns` is the half interval of what all
-    delays share, to which every absolute distance owes as much. `verdict` says what is determined, `next_best` what one
-    more measurement would bring, the best one first.
+    `open_ns` are half intervals that can include those of undetermined delays. `common_ns` is the half interval of the
+    mean of all delays, which is an error of every absolute distance. `verdict` states which delays are determined,
+    `next_best` the gains of single additional measurements, the best one first.
     """
 
     half_ns: Mapping[int, float]
@@ -89,24 +93,24 @@ class _Plan:
 
     @property
     def undetermined(self) -> tuple[int, ...]:
-        """The tags whose delay stays open."""
+        """The tags whose delay is not determined."""
         return tuple(int(tag) for tag in self.verdict.named("delay"))
 
     @property
     def steps(self) -> tuple[str, ...]:
-        """What to do, a line each."""
+        """The steps of the plan, one line each."""
         return tuple(f"{k}. {step}" for k, step in enumerate(self._steps(), start=1))
 
     def _steps(self) -> list[str]:
         raise NotImplementedError
 
-    def _promise(self) -> tuple[str, list[str]]:
-        """Return what errors are assumed, and lines on what delays share."""
+    def _expectation(self) -> tuple[str, list[str]]:
+        """Return the assumed errors in words, and lines on the common part of the delays."""
         raise NotImplementedError
 
     def __str__(self) -> str:
         """Return the steps and the intervals."""
-        assumed, shared = self._promise()
+        assumed, shared = self._expectation()
         wide = {tag: f"undetermined (± {half:.2f} ns)" for tag, half in self.open_ns.items()}
         lines = [
             *self.steps,
@@ -128,7 +132,7 @@ class _Plan:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything as JSON takes it; null where nothing is determined."""
+        """Return all fields for JSON; undetermined values are null."""
         return {
             "half_interval_ns": for_json(self.half_ns),
             "common_ns": for_json(self.common_ns),
@@ -143,10 +147,9 @@ class _Plan:
 class Plan(_Plan):
     """A plan for `survey`: arrangements of boards that stand still.
 
-    `after_ns` has the intervals when only the first arrangement, the first two and so on are made; `with_curve_ns` all
-    intervals where a curve over power is fitted along, as surveys do unless they are told otherwise. Of all pairs a
-    share `reflected` is taken to say nothing. With `known_beside`, distances or places are known that a survey must be
-    told.
+    `after_ns` are the intervals after the first arrangement, the first two and so on; `with_curve_ns` are the intervals
+    with a curve over power, which surveys fit by default. A share `reflected` of all pairs has no information. With
+    `known_beside`, the survey needs a file of known distances or positions.
 
     >>> import calib
     >>> plan = calib.plan(4, on="line", arrangements=6)
@@ -182,7 +185,7 @@ class Plan(_Plan):
         ]
         return [first, *made, f"Survey all recordings together{shape}.{beside if self.known_beside else ''}"]
 
-    def _promise(self) -> tuple[str, list[str]]:
+    def _expectation(self) -> tuple[str, list[str]]:
         share = f", and {100 * self.reflected:g} % of the pairs are reflected" if self.reflected else ""
         shared = [f"  common part ± {self.common_ns:.3f} ns"] if math.isfinite(self.common_ns) else []
         halves = zip(
@@ -197,7 +200,7 @@ class Plan(_Plan):
         return f"the constant error of a pair is {100 * self.pair_error_m:.1f} cm{share}", shared
 
     def commands(self, ports: str) -> Iterator[str]:
-        """Yield the commands that carry it out; `ports` names the boards' serial ports."""
+        """Yield the commands of the plan; `ports` are the boards' serial ports."""
         for one in self.arrangements:
             order = f" --order {','.join(map(str, one.order()))}" if self.on == "line" else ""
             shape = f" --known {self.on}{order}" if self.on else ""
@@ -207,7 +210,7 @@ class Plan(_Plan):
         yield f"calib survey {' '.join(f'{one.name}.uwb' for one in self.arrangements)}{beside} -o calibration.json"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything as JSON takes it; null where nothing is determined."""
+        """Return all fields for JSON; undetermined values are null."""
         return _Plan.to_dict(self) | {
             "on": self.on,
             "rate_hz": self.rate_hz,
@@ -225,9 +228,9 @@ class Plan(_Plan):
 class FlightPlan(_Plan):
     """A plan of a flight.
 
-    `open_ns` has every delay. `common_ns` and `apart_ns`, how well
-    each delay is known against the mean of all, are of the delays that are determined, or of all where none is.
-    `path_m` (k, bodies, 3) is where the moving `bodies` are, `stands` where others stand.
+    `open_ns` has all delays. `common_ns` is the half interval of their mean, `apart_ns` that of each relative to the
+    mean; both are for the determined delays, or for all if none is determined. `path_m` (k, bodies, 3) are positions of
+    the moving `bodies`, `stands` those of the others.
 
     >>> import calib
     >>> plan = calib.plan_flight(2, seconds=20.0, poses_until_s=0.0, anchors=[11, 12, 13, 14])
@@ -279,14 +282,14 @@ class FlightPlan(_Plan):
         ]
         return [text for needed, text in steps if needed]
 
-    def _promise(self) -> tuple[str, list[str]]:
+    def _expectation(self) -> tuple[str, list[str]]:
         which = "" if len(self.undetermined) in (0, len(self.half_ns)) else " of those that are determined"
         assumed = f"ranges have {100 * self.settings.noise_m:.1f} cm of noise and {100 * self.reflected:.0f} % are"
         shared = f"  common part{which} ± {self.common_ns:.3f} ns, each relative to the mean ± {self.apart_ns:.3f} ns"
         return f"{assumed} reflected", [shared]
 
     def commands(self, ports: str, recording: str = "") -> Iterator[str]:
-        """Yield the commands that carry it out; a `recording` that it was planned from is not recorded again."""
+        """Yield the commands of the plan; those of recording are left out for a plan from a `recording`."""
         name, flown = recording or self.source, self.settings
         if flown.robots is not None:
             name = "flight.uwb"
@@ -305,7 +308,7 @@ class FlightPlan(_Plan):
         yield f"calib fit {name} --truth ranges {' '.join(words)} -o calibration.json"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything but the path as JSON takes it; null where nothing is determined."""
+        """Return all fields but the path for JSON; undetermined values are null."""
         return _Plan.to_dict(self) | {
             "on": "flight",
             "ranges": self.ranges,

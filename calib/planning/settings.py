@@ -13,10 +13,10 @@ from uwblink.display import first_few
 from uwblink.settings import setting
 
 ROOMS_M: Final = {"line": (5.0,), "plane": (3.0, 2.0), "space": (6.0, 5.0, 2.5)}
-"""Where boards may stand, and its default lengths: a string across a room, a large table, a room."""
+"""Default lengths of the places for boards: a string across a room, a large table, a room."""
 
 IMU_GRADES: Final = ("consumer", "industrial", "tactical")
-"""Grades of IMUs whose noise data sheets state (`calib.evaluation.IMUS`)."""
+"""Grades of IMUs, whose noise is that of data sheets (`calib.evaluation.IMUS`)."""
 
 
 def read_numbers(text: str, parameter: str | None = None) -> list[float]:
@@ -36,9 +36,10 @@ def read_whole(text: str, parameter: str | None = None) -> list[int]:
 
 
 def _refuse(settings: CheckedSettings, refused: Iterable[tuple[str, Any, str]]) -> None:
-    """Raise `BadInputError` for the first that is refused.
+    """Raise `BadInputError` for the first wrong setting.
 
-    `refused` has the name of a setting, whether (or what of it) is wrong, and a text, which may name that.
+    A row of `refused` has the name of a setting, its wrong part (false if nothing is wrong), and a text with fields for
+    the value and the wrong part.
     """
     for name, wrong, text in refused:
         if wrong:
@@ -69,11 +70,11 @@ OF_BOTH: Final[dict[str, Any]] = {
 class SurveyPlanSettings(CheckedSettings):
     """Settings of `calib.plan`, which also takes them as keyword arguments; raises `BadInputError`.
 
-    `on` is "line" (a string), "plane" (a table) or "space" (a room), of `size_m` (up to three lengths). `taped`
-    distances will be measured to `tape_sigma_m`; `anchors` are boards that stay where they are, at places known to
-    `anchor_sigma_m`. `arrangements` None makes as many as are worth it, at most 12. `pair_error_m` is the constant
-    error that a pair has in an arrangement, `reflected` the share of pairs that are reflected and tell nothing.
-    `tags` are the boards, which `plan` fills in.
+    `on` is "line" (a string), "plane" (a table) or "space" (a room), of `size_m` (up to three lengths). `taped` is the
+    number of distances that will be measured, with a standard deviation of `tape_sigma_m`; `anchors` are boards at
+    fixed positions that are known to `anchor_sigma_m`. If `arrangements` is None, arrangements are added while they
+    improve the accuracy, up to 12. `pair_error_m` is the constant error of a pair in an arrangement, `reflected` the
+    share of reflected pairs, which have no information. `tags` are the boards; `plan` sets them.
 
     >>> import calib
     >>> settings = calib.SurveyPlanSettings(on="plane", size_m=(3.0, 2.0), arrangements=2)
@@ -102,7 +103,7 @@ class SurveyPlanSettings(CheckedSettings):
     pair_error_m: float = setting(
         0.02, "Constant error of a pair in an arrangement (m).", flag="--pair-error", bounds=(1e-9, 100.0)
     )
-    # Of more pairs nobody could tell which are reflected.
+    # With a larger share a survey could not tell which pairs are reflected.
     reflected: float = setting(0.0, "Share of pairs that are reflected.", bounds=(0.0, 0.3))
     rate_hz: float = setting(50.0, **OF_BOTH["rate_hz"], bounds=(1e-3, 1e5))
     seed: int = 1
@@ -125,7 +126,7 @@ class SurveyPlanSettings(CheckedSettings):
 
     @property
     def dimensions(self) -> int:
-        """In how many dimensions boards may stand."""
+        """The number of dimensions of the boards' positions."""
         return len(ROOMS_M[self.on])
 
 
@@ -133,15 +134,15 @@ class SurveyPlanSettings(CheckedSettings):
 class FlightPlanSettings(CheckedSettings):
     """Settings of `calib.plan_flight`, which also takes them as keyword arguments; raises `BadInputError`.
 
-    Without a recording robots fly for `seconds` about a room of `size_m` at about `speed_m_s`, tags of a robot are
-    `apart_m` from each other, and all pairs but those of two `anchors` (ids of tags about the walls) range in turn,
-    `rate_hz` times a second. Robots stand for the first `still_s`.
+    Without a recording, robots fly for `seconds` in a room of `size_m` at about `speed_m_s`; the tags of a robot are
+    `apart_m` from each other. All pairs of tags on different robots and `anchors` (ids of tags at the walls) range in
+    turn, `rate_hz` times per second in total, but not two anchors. Robots stand still for the first `still_s`.
 
-    Positions will be known for the first `poses_until_s` (None: all along); `attitudes` come from "poses" (an attitude
-    reference), from the "imu" or from nothing ("none"); `imu` is its grade. `anchor_places` are "given" or "sought".
-    `taped` distances are measured to `tape_sigma_m` where they bring most: of tags of robots that stand, and of anchors
-    whose places are sought. A range has `noise_m`, and a share `reflected` is longer by 0.3 m on average. `robots` are
-    the tags of each robot, which `plan_flight` fills in.
+    Positions are known for the first `poses_until_s` (None: always). `attitudes` come from "poses" (an attitude
+    reference), from the "imu", or are unknown ("none"); `imu` is its grade. `anchor_places` are "given" or "sought".
+    `taped` is the number of distances that are measured to `tape_sigma_m`, at the best places: between tags of robots
+    that stand still, or between anchors at unknown positions. Ranges have a noise of `noise_m`, and a share `reflected`
+    is longer by 0.3 m on average. `robots` are the tags of each robot; `plan_flight` sets them.
 
     >>> import calib
     >>> settings = calib.FlightPlanSettings(seconds=10.0, rate_hz=40.0)
@@ -186,7 +187,7 @@ class FlightPlanSettings(CheckedSettings):
     seed: int = 1
 
     def __post_init__(self) -> None:
-        """Check all values, and the robots where there are some."""
+        """Check all values, and those of the robots if there are any."""
         CheckedSettings.__post_init__(self)
         if self.imu is not None:
             check_choice("imu", self.imu, IMU_GRADES)
@@ -194,7 +195,7 @@ class FlightPlanSettings(CheckedSettings):
         listed = [(2 * k + 1, 2 * k + 2) for k in range(asked)] if isinstance(asked, int) else asked or ()
         robots = tuple(tuple(map(int, tags)) for tags in listed)
         tags, anchors, ranges = [tag for robot in robots for tag in robot], self.anchors, self.seconds * self.rate_hz
-        # Bounds that keep a mistyped number from filling the memory: 1770 pairs, and the exchanges of five flights.
+        # A mistyped number must not exhaust the memory: 60 tags are 1770 pairs, 200 000 ranges are five flights.
         most_tags, most_ranges = 60, 200_000
         once = len(set(tags)) == len(tags) and len(tags) + len(anchors) <= most_tags
         among = (

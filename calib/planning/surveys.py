@@ -1,9 +1,9 @@
 """Plans of surveys: which arrangements of boards to record, and the expected accuracy of the delays.
 
-What comes of them is Fisher's information of a survey's own rows, without data. Places are unknown. With reflections,
-which pairs are reflected is drawn, and the prediction is the root mean square over the draws: a reflected pair has
-nearly no information on the delays. A curve over power is what a survey takes it for, a smooth function of the power,
-which falls with distance as in free space, of 5 cm.
+The expected accuracy is Fisher's information of the rows of a survey, without data; positions are unknown. If pairs are
+reflected, the reflected pairs are drawn at random and the prediction is the root mean square over the draws, because a
+reflected pair has hardly any information on the delays. A curve over power has the prior of a survey, with a standard
+deviation of 5 cm; powers fall with distance as in free space.
 """
 
 from __future__ import annotations
@@ -25,32 +25,33 @@ from calib.planning.settings import ROOMS_M, SurveyPlanSettings
 from calib.spread import TWO_SIDED_95
 from calib.surveys.knowledge import KnownPosition
 from calib.surveys.network import Boards, Case, CurvePrior, Linear, Network
-from calib.surveys.outcome import students_factor, verdict_on_delays
+from calib.surveys.outcome import interval_factor, verdict_on_delays
 from calib.surveys.recordings import PairMeans
 from uwblink.arrays import Bools, Floats
 from uwblink.recording.schema import KnownDistance
 
 PLANNED_CURVE_STD_M = 0.05
-"""Standard deviation of a curve over power: half that of the published curves (`CURVE_LENGTH_DB`). With all of it plans
-of six boards in five arrangements would promise no delay beside a curve, which surveys do find (`make surveys`)."""
+"""Standard deviation of a curve over power: half that of the published curves (`CURVE_LENGTH_DB`). With the whole
+standard deviation, plans of six boards in five arrangements would predict no delay beside a curve, but surveys find the
+delays (`make surveys`)."""
 
 POWER_AT_1_M_DBM = -74.0
-"""First-path power at a metre: the upper quartile of power times squared distance in the MILUV flight among obstacles,
-whose median is -77 dBm."""
+"""First-path power at one metre: the upper quartile of power times squared distance in the MILUV flight among
+obstacles, whose median is -77 dBm."""
 
 
-def random_arrangements(inputs: SurveyPlanSettings, count: int, tries: int = 400) -> list[PlannedArrangement]:
-    """Return random arrangements: orders on a line at even steps, random places on a table or in a room.
+def random_arrangements(inputs: SurveyPlanSettings, count: int) -> list[PlannedArrangement]:
+    """Return random arrangements: orders on a line with equal distances, random positions on a table or in a room.
 
-    Fewer than `count` where a line has fewer orders, or a room too little space. Anchors stay where the first one has
-    them: the corners of a room are as good a guess as any.
+    There are fewer than `count` if a line has fewer orders, or a room has too little space. Anchors have the positions
+    of the first arrangement in all others.
     """
     rng, tags, dimensions = np.random.default_rng(inputs.seed), inputs.tags, inputs.dimensions
     size = np.array(ROOMS_M[inputs.on] if inputs.size_m is None else inputs.size_m, dtype=float)
     if inputs.on == "line" and inputs.size_m is None:
         size = np.maximum(size, 0.8 * (len(tags) - 1))
     found: dict[tuple[int, ...] | int, PlannedArrangement] = {}
-    for number in range(tries):
+    for number in range(400):
         if len(found) == count:
             break
         key: tuple[int, ...] | int = number
@@ -62,7 +63,7 @@ def random_arrangements(inputs: SurveyPlanSettings, count: int, tries: int = 400
             place[list(order), 0] = np.round(np.linspace(0, float(size[0]), len(tags)), 1)
         else:
             place[:, :dimensions] = np.round(rng.uniform(0, size, (len(tags), dimensions)), 1)
-            # Five wavelengths: nearer, powers saturate and fields are not yet waves.
+            # Five wavelengths: at shorter distances powers saturate, and the far field does not begin.
             if min(np.linalg.norm(one - other) for one, other in combinations(place, 2)) < 0.4:
                 continue
         spots = {tag: (x, y, z) for tag, (x, y, z) in zip(tags, place.tolist(), strict=True)}
@@ -77,11 +78,11 @@ def delay_information(
     curve: CurvePrior | None = None,
     reflected: Bools | Sequence[float] = (0.0,),
 ) -> Floats:
-    """Return the information on delays, 1/ns^2, and on a curve, that an arrangement gives, whatever its places.
+    """Return the information of an arrangement with unknown positions on delays, 1/ns^2, and on a curve.
 
-    It is (draws, k, k): `reflected` tells for each draw which pairs are reflected.
+    Its shape is (draws, k, k); `reflected` has a mask of the reflected pairs for each draw.
     """
-    # A network has its tags in order, a plan as they are given: boards are numbered.
+    # A network has its tags in ascending order, but a plan in the given order: boards are numbered.
     boards, number = tuple(range(len(inputs.tags))), inputs.tags.index
     pairs = np.array(list(combinations(boards, 2)))
     none = np.zeros(len(pairs))
@@ -128,7 +129,7 @@ def predict(
             # The prior counts once, below.
             design = prior.design.reshape(*powers.shape, -1)[k]
             own = replace(prior, design=design, precision=np.zeros_like(prior.precision))
-        # A root mean square over a hundred draws of which pairs are reflected is good to a few per cent.
+        # The root mean square over a hundred draws of the reflected pairs has an error of a few per cent.
         shape = (100 if inputs.reflected else 1, len(first))
         drawn = np.random.default_rng([inputs.seed, k]).uniform(size=shape) < inputs.reflected
         parts.append(delay_information(inputs, one, own, drawn))
@@ -139,7 +140,7 @@ def predict(
 
 
 def _averaged(informations: Floats, tags: Sequence[int]) -> Precision[Floats]:
-    """Return root mean squares over the draws (k, tags, tags) that determine it; infinite where most do not."""
+    """Return root mean squares over the draws (k, tags, tags) that determine a value; infinite if most do not."""
     verdicts = [verdict_on_delays(one, tags) for one in informations]
     covariance = np.array([one.covariance for one in verdicts])
     centre = np.eye(len(tags)) - 1 / len(tags)
@@ -155,10 +156,10 @@ def _averaged(informations: Floats, tags: Sequence[int]) -> Precision[Floats]:
 def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None, **changes: Any) -> Plan:
     """Plan a calibration of boards without true distances: arrangements, and the expected accuracy of the delays.
 
-    `boards` is how many there are, or their ids. `settings` and keyword arguments named like its fields
-    (`SurveyPlanSettings`, which explains them) say what one has. Each of the arrangements is the best of sixty random
-    ones after those before it. Where pairs are reflected, what is promised is the mean over which pairs those are.
-    Raises `BadInputError` for what cannot be.
+    `boards` is the number of boards, or their ids. `settings` and keyword arguments named like its fields
+    (`SurveyPlanSettings`, which explains them) state the equipment. Each arrangement is the best of sixty random ones,
+    given those before it. If pairs are reflected, predictions are means over random choices of the reflected pairs.
+    Raises `BadInputError` for boards or settings that are impossible.
 
     >>> import calib
     >>> calib.plan(3, on="line", arrangements=1).undetermined
@@ -215,16 +216,18 @@ def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None
 
 
 def _choose(informations: list[Floats], count: int | None) -> list[int]:
-    """Return `count` arrangements, or as many as are worth it: each the best after those before it."""
+    """Return the numbers of `count` arrangements, or of as many as improve the accuracy; each is the best one given
+    those before it.
+    """
     total = np.zeros_like(informations[0])
     found: list[int] = []
-    # Twelve are an hour's work.
+    # Twelve arrangements take about an hour.
     while len(found) < (count or 12):
-        # The same once more would have the same errors, unless boards were taken away in between.
+        # An arrangement that is repeated has the same errors of pairs, unless the boards were removed in between.
         left = [k for k in range(len(informations)) if k not in found] or list(range(len(informations)))
         best = min(left, key=lambda k: mean_std_ns(total + informations[k]))
         before, after = mean_std_ns(total), mean_std_ns(total + informations[best])
-        # By the root of their number arrangements narrow the mean interval, so that about eight are worth 6 % each.
+        # The mean interval falls with the root of their number, so the eighth arrangement still reduces it by 6 %.
         if count is None and len(found) >= 2 and after > 0.94 * before:
             break
         found.append(best)
@@ -235,7 +238,9 @@ def _choose(informations: list[Floats], count: int | None) -> list[int]:
 def _best_tape(
     inputs: SurveyPlanSettings, chosen: Sequence[PlannedArrangement]
 ) -> tuple[Floats, PlannedArrangement] | None:
-    """Return the arrangement with the further taped distance that brings most, and the information of all then."""
+    """Return the information of all arrangements with the best additional taped distance, and the arrangement with it;
+    None without any.
+    """
     found = []
     each = [delay_information(inputs, one)[0] for one in chosen]
     for one, own in zip(chosen, each, strict=True):
@@ -247,10 +252,10 @@ def _best_tape(
 
 
 def _interval(inputs: SurveyPlanSettings, chosen: Sequence[PlannedArrangement]) -> float:
-    """Return the factor of a standard deviation that makes half an interval of 95 %, by the freedoms that are left."""
+    """Return half the length of a 95 % interval over the standard deviation, for the remaining degrees of freedom."""
     boards, dimensions = len(inputs.tags), inputs.dimensions
     motions = 0 if inputs.anchors else math.comb(dimensions + 1, 2)
     rows, unknown = math.comb(boards, 2), boards * dimensions - motions
     known = len(inputs.anchors) * dimensions
     left = sum(rows + len(one.taped) + known - min(unknown, rows) for one in chosen)
-    return TWO_SIDED_95 * students_factor(max(left - boards, 0.0))
+    return TWO_SIDED_95 * interval_factor(max(left - boards, 0.0))

@@ -17,6 +17,7 @@ from calib.calibration.document import pair_name, split_text
 from calib.calibration.model import known_facts
 from calib.estimator.range_model import METRES_A_NS
 from calib.evaluation.statistics import Stats
+from calib.findings import contradictions_in
 from calib.report.results import Results
 from calib.spread import STD_OF_MEDIAN, TWO_SIDED_95
 from uwblink.pages.blocks import Block, Table, Text
@@ -234,7 +235,7 @@ def _of_survey(results: Results) -> Iterator[Criterion]:
     """Yield the criteria for surveys of boards that stand still."""
     made = results.calibration.provenance
     rests, pairs = made["rests_on"], int(made["pairs"])
-    against = list(map(str, made.get("findings", [])))
+    against = contradictions_in(made)
     yield Criterion(
         "Do the ranges agree with the known facts?",
         "no contradiction to known shapes, distances, orders and labels; no board was moved",

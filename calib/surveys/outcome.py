@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
 
 import uwblink
 from calib.calibration.model import Calibration, Uncertainty, matrix_of
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis, flat_curve
 from calib.errors import UnanswerableError
 from calib.estimator.range_model import METRES_A_NS
-from calib.findings import Finding
+from calib.findings import Finding, for_provenance, warning
 from calib.information import InformationColumn, Verdict, judge, reduced
 from calib.settings import SurveySettings
-from calib.spread import TWO_SIDED_95
+from calib.spread import students_factor
 from calib.surveys.network import Boards
 from calib.surveys.recordings import LIFT, SurveyData
 from calib.surveys.result import (
@@ -34,12 +33,12 @@ from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
 
-def students_factor(freedom: float) -> float:
-    """Return the ratio of Student's 95 % quantile to the normal one, because the spread of errors is estimated.
+def interval_factor(freedom: float) -> float:
+    """Return the factor of intervals, because the spread of errors is estimated with so many degrees of freedom.
 
     Its prior counts as a few degrees of freedom.
     """
-    return float(stdtrit(max(freedom + PAIR_PRIOR_FREEDOM, 1.0), 0.975)) / TWO_SIDED_95
+    return students_factor(max(freedom + PAIR_PRIOR_FREEDOM, 1.0))
 
 
 def verdict_on_delays(information: Floats, tags: Sequence[int]) -> Verdict:
@@ -70,14 +69,13 @@ def result_of(
             undetermined=[[int(tag) for tag in free]],
         )
     reflected = tuple(_reflected_pairs(found))
-    warnings = (*data.warnings, *map(str, findings), *_notes(found, second, verdict, reflected))
+    findings = (*data.limits, *findings, *_limits(found, second, verdict, reflected))
     arrangements = tuple(_arrangement(found, k) for k in range(len(network.arrangements)))
     more = ({"settings": asked.changed()} if asked.changed() else {}) | {
         "surveyed": [one.to_dict() for one in arrangements],
         "reflected": [one.to_dict() for one in reflected],
-        "findings": list(map(str, findings)),
         "second_best": None if second is None else round(second.worse, 2),
-        "warnings": list(warnings),
+        **for_provenance(findings),
     }
     return SurveyResult(
         calibration=_calibration(data, found, verdict, taken, more),
@@ -85,8 +83,7 @@ def result_of(
         verdict=verdict,
         pair_error_m=found.case.pair_m,
         second_best=second,
-        contradictions=findings,
-        warnings=warnings,
+        findings=findings,
         reflected=reflected,
     )
 
@@ -102,47 +99,41 @@ def _reflected_pairs(found: Solution) -> list[ReflectedPair]:
     ]
 
 
-def _notes(
+def _limits(
     found: Solution, second: SecondBest | None, verdict: Verdict, reflected: Sequence[ReflectedPair]
-) -> list[str]:
-    """Return the warnings of a survey, one line each."""
-    believed = [one for one in reflected if one.believed]
-    perhaps = ", ".join(
-        f"{one.first}-{one.second} in {one.arrangement} ({100 * one.chance:.0f} %)"
-        for one in reflected
-        if not one.believed
-    )
-    where, who, worse = ("", (), 0.0) if second is None else (second.arrangement, second.tags, second.worse)
-    notes = [
-        *(
-            (
-                True,
+) -> Iterator[Finding]:
+    """Yield the limits of a survey."""
+    for one in reflected:
+        if one.likely:
+            yield warning(
+                "reflections of a pair",
                 f"{one.arrangement}: the range of {one.first} and {one.second} is {100 * one.longer_m:+.0f} cm too "
                 f"long compared with all others: probably reflected ({100 * one.chance:.0f} %), so it has little "
                 f"weight",
             )
-            for one in believed
-        ),
-        (perhaps, f"may also be reflected: {perhaps}; intervals are widened for this"),
-        (not found.settled, "the search stopped before it converged: delays and positions are not final"),
-        (
-            verdict.free,
-            f"not determined: {'; '.join(verdict.free)}"
-            + f"; left out: tags {', '.join(verdict.named('delay'))}" * bool(verdict.named("delay")),
-        ),
-        (
-            found.network.curve is not None,
+    perhaps = [one for one in reflected if not one.likely]
+    if perhaps:
+        named = (f"{one.first}-{one.second} in {one.arrangement} ({100 * one.chance:.0f} %)" for one in perhaps)
+        text = f"may also be reflected: {', '.join(named)}; intervals are widened for this"
+        yield warning("reflections of a pair", text)
+    if not found.settled:
+        yield warning("not converged", "the search stopped before it converged: delays and positions are not final")
+    if verdict.free:
+        delays = ", ".join(verdict.named("delay"))
+        text = f"not determined: {'; '.join(verdict.free)}" + f"; left out: tags {delays}" * bool(delays)
+        yield warning("undetermined delays", text)
+    if found.network.curve is not None:
+        yield warning(
+            "common part of delays",
             "a constant of the curve and a common shift of all delays cannot be separated by ranges: the common part "
-            "of the delays is only known as well as the curve at its reference power. Differences of delays are "
-            "known better, and a measured distance (`known`) determines the common part",
-        ),
-        (
-            second is not None and second.ambiguous,
-            f"{where}: another solution agrees with the ranges as well (worse by {worse:.1f}), with other positions "
-            f"of boards {', '.join(map(str, who))}",
-        ),
-    ]
-    return [text for needed, text in notes if needed]
+            "of the delays is only known as well as the curve at its reference power, differences of delays better",
+        )
+    if second is not None and second.ambiguous:
+        yield warning(
+            "two solutions of a survey",
+            f"{second.arrangement}: another solution agrees with the ranges as well (worse by {second.worse:.1f}), "
+            f"with other positions of boards {', '.join(map(str, second.tags))}",
+        )
 
 
 def _calibration(
@@ -151,7 +142,7 @@ def _calibration(
     """Return the calibration: delays that are determined, the curve, their uncertainty and provenance."""
     network, known, freedom = found.network, verdict.determined, found.freedom
     tags = [tag for tag, good in zip(network.tags, known.tolist(), strict=True) if good]
-    covariance = students_factor(freedom) ** 2 * verdict.covariance[np.ix_(known, known)]
+    covariance = interval_factor(freedom) ** 2 * verdict.covariance[np.ix_(known, known)]
     std = dict(zip(tags, np.sqrt(np.diag(covariance)).tolist(), strict=True)) | dict.fromkeys(network.fixed_ns, 0.0)
     delays = dict(zip(network.tags, found.delays.tolist(), strict=True)) | network.fixed_ns
     noise = float(np.sqrt(np.average(network.means.noise_m**2, weights=network.means.count)))
@@ -167,7 +158,7 @@ def _calibration(
         where, knots = network.layout.where["curve"], network.curve.knots
         span = (float(knots[0]), float(knots[-1]))
         curve = Curve(tuple(knots.tolist()), tuple(found.x[where].tolist()), DEGREE, span)
-        curve_covariance = found.covariance()[where, where] * students_factor(freedom) ** 2
+        curve_covariance = found.covariance()[where, where] * interval_factor(freedom) ** 2
         gauge = f"the bias curve is zero at {ALPHA_DBM:g} dBm; the delays contain the common constant"
     fixed = {"fixed_ns": {str(tag): delay for tag, delay in sorted(network.fixed_ns.items())}}
     provenance = (fixed if network.fixed_ns else {}) | {
@@ -256,7 +247,7 @@ def _frame(points: Floats, boards: Boards) -> tuple[Floats, list[int], str]:
 def _arrangement(found: Solution, number: int) -> SurveyedArrangement:
     """Return the places of boards in an arrangement, in the frame of known positions or of its first boards."""
     network, boards, seats = found.network, found.network.arrangements[number], found.network.seats(number)
-    points, covariance = network.positions_m(found.x), found.covariance() * students_factor(found.freedom) ** 2
+    points, covariance = network.positions_m(found.x), found.covariance() * interval_factor(found.freedom) ** 2
     own = [slice(3 * seat, 3 * seat + 3) for seat in seats.tolist()]
     surveyed = tuple(
         SurveyedBoard(tag, (x, y, z), covariance[one, one], bool(np.trace(covariance[one, one]) < 1.0))

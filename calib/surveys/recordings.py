@@ -12,18 +12,18 @@ from dataclasses import dataclass, replace
 from pathlib import PurePath
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, special
 
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.data.ranges import Ranges, concatenate
-from calib.data.sources import Data, antenna_delays_of, each, opened
+from calib.data.sources import Data, antenna_delays_of, each, fingerprint_of, opened, refuse_repeated
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.optimize import LONGER, maximize
 from calib.estimator.range_model import RangeModel
-from calib.estimator.range_rows import RESIDUAL, Part
+from calib.estimator.range_rows import RESIDUAL, block_of
 from calib.estimator.unknowns import Prior, Priors, Unknown
-from calib.findings import Finding
-from calib.pairs import Pairs, pairs_of
+from calib.findings import Finding, warning
+from calib.pairs import Pairs
 from calib.settings import FitSettings
 from calib.spread import STD_OF_MEDIAN, medians, robust_spread
 from calib.surveys.knowledge import Knowledge
@@ -70,14 +70,14 @@ class PairMeans(ColumnTable):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyData:
-    """Means of pairs, the arrangements by their numbers, distances in recordings, and warnings."""
+    """Means of pairs, the arrangements by their numbers, distances in recordings, contradictions and limits."""
 
     means: PairMeans
     arrangements: tuple[Arrangement, ...]
     distances: tuple[KnownDistance, ...]
     sources: tuple[str, ...]
     findings: tuple[Finding, ...]
-    warnings: tuple[str, ...]
+    limits: tuple[Finding, ...]
     antenna_delays: AntennaDelays
 
 
@@ -101,14 +101,16 @@ def read_surveys(data: Data | Iterable[Data], knowledge: Knowledge) -> SurveyDat
             findings += find_motion(one.name, ranges[rows])
             arrangements[one.name] = one
     whole = concatenate([ranges for ranges, _, _ in recordings])
+    refuse_repeated(whole.recordings)
     means, few = pair_means(whole, np.concatenate(numbers))
+    text = f"{few} pairs of an arrangement have less than 5 ranges and are left out"
     return SurveyData(
         means=means,
         arrangements=tuple(arrangements.values()),
         distances=tuple(distance for _, _, stated in recordings for distance in stated),
         sources=tuple(ranges.source for ranges, _, _ in recordings),
         findings=tuple(findings),
-        warnings=(f"{few} pairs of an arrangement have less than 5 ranges and are left out",) if few else (),
+        limits=(warning("few ranges of a pair", text),) if few else (),
         antenna_delays=whole.antenna_delays,
     )
 
@@ -116,11 +118,13 @@ def read_surveys(data: Data | Iterable[Data], knowledge: Knowledge) -> SurveyDat
 def _load(data: Data) -> tuple[Ranges, list[Arrangement], list[KnownDistance]]:
     """Return the possible ranges of a recording, without true distances, and its other contents."""
     if isinstance(data, Ranges):
-        return replace(data, truth_m=np.zeros(len(data))).usable(need_power=False), [], []
+        # Parts of one recording have the same fingerprint.
+        return replace(data, truth_m=np.zeros(len(data)), recordings=()).usable(need_power=False), [], []
     with opened(data) as (name, source):
         exchanges = single_reports(source.exchanges).exchanges
         delays, truth = antenna_delays_of(source, name), np.zeros(len(exchanges))
         ranges = Ranges.from_exchanges(exchanges, truth, source=name, antenna_delays=delays)
+        ranges = replace(ranges, recordings=((name, fingerprint_of(exchanges)),))
         marked, stated = getattr(source, "arrangements", ()), getattr(source, "known_distances", ())
         return ranges.usable(need_power=False), list(marked), list(stated)
 
@@ -149,7 +153,7 @@ def _arrangements(
 def _binned(ranges: Ranges, bin_ns: int) -> tuple[Ints, Ints, Floats, Floats]:
     """Return the pairs of tags (p, 2), the starts of bins of time (b,) in ns, medians (p, b) of their ranges in each
     (NaN without any), and the noise of these medians (p,), without the effect of steps."""
-    pairs, begin = pairs_of(ranges.initiator, ranges.target), int(ranges.time_ns.min())
+    pairs, begin = ranges.pairs, int(ranges.time_ns.min())
     bins, at = np.unique((ranges.time_ns - begin) // bin_ns, return_inverse=True)
     median = np.full((len(pairs.ends), len(bins)), np.nan)
     key = pairs.number * len(bins) + at
@@ -170,20 +174,21 @@ def _steps(median: Floats, window: int) -> Floats:
     return np.asarray(found[:, window:] - found[:, :-window])
 
 
-def still_stretches(ranges: Ranges, bin_ns: int = 1_000_000_000) -> list[tuple[int, int]]:
+def still_stretches(ranges: Ranges) -> list[tuple[int, int]]:
     """Return the stretches of time, (start, end) each in ns, in which no board was moved.
 
     A motion is a simultaneous step of the ranges of two pairs (or of the only pair). Times within a window of a motion,
     or between two motions less than 15 s apart, belong to no stretch.
     """
-    _, starts, median, noise = _binned(ranges, bin_ns)
+    second_ns = 1_000_000_000
+    _, starts, median, noise = _binned(ranges, second_ns)
     # People who walk past change ranges by less than 5 cm, or only the ranges of one pair.
     threshold = np.maximum(0.05, SIGMAS * noise * np.sqrt(2 / WINDOW_BINS))
     moving = (np.abs(_steps(median, WINDOW_BINS)) > threshold[:, None]).sum(axis=0) >= min(2, len(median))
     # An edge with a step in its window is not the step itself: only bins outside all such windows are still.
     still = np.concatenate([[False], ~(moving[:-1] | moving[1:]), [False]]).astype(np.int8)
     first, last = np.flatnonzero(np.diff(still) == 1), np.flatnonzero(np.diff(still) == -1) - 1
-    found = zip(starts[first].tolist(), (starts[last] + bin_ns).tolist(), strict=True)
+    found = zip(starts[first].tolist(), (starts[last] + second_ns).tolist(), strict=True)
     # Shorter stretches between two motions are part of the motion.
     return [(a, b) for a, b in found if b - a >= 15e9]
 
@@ -216,12 +221,15 @@ def find_motion(name: str, ranges: Ranges) -> list[Finding]:
     mine = changed[:, edge] & (member[board] > 0)
     by_m = float(np.abs(step[mine, edge]).max())
     # Medians of short spans determine the time better than medians of long ones.
-    edge = np.argmax(np.nan_to_num(np.abs(_steps(median, WINDOW_BINS)[mine, 1:-1])).sum(axis=0))
+    at, edge = edge, np.argmax(np.nan_to_num(np.abs(_steps(median, WINDOW_BINS)[mine, 1:-1])).sum(axis=0))
     text = (
         f"{name}: board {tag} was moved {(starts[edge + 1] - begin) * 1e-9:.0f} s after the start (ranges changed by "
         f"up to {100 * by_m:.0f} cm)"
     )
-    return [Finding("board moved within an arrangement", text, "record that arrangement again, or end it before", 0.0)]
+    # At least two pairs changed at one of all edges.
+    second = float(np.sort(size[mine, at])[-2])
+    p_value = min(1.0, 2 * size.size * float(special.ndtr(-second)))
+    return [warning("board moved within an arrangement", text, p_value)]
 
 
 def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
@@ -231,7 +239,7 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
     Pairs of fewer than five ranges in an arrangement are left out; the second value counts them. Raises
     `UnanswerableError` where none is left.
     """
-    pairs = pairs_of(ranges.initiator, ranges.target)
+    pairs = ranges.pairs
     key = arrangement * len(pairs.ends) + pairs.number
     keys, counts = np.unique(key[arrangement >= 0], return_counts=True)
     # With five ranges the spread is known to a third (the root of 1/8).
@@ -276,10 +284,12 @@ def _locations(ranges: Ranges, groups: Pairs) -> tuple[Floats, Floats, Floats]:
     model = replace(model, noise=None, pairs=groups)
     residual = ranges.raw_m - median[group]
     errors, unknowns, parts = model.error_model(residual)
-    mean = Unknown(
-        kind="mean", names=("",) * len(median), start=np.zeros(len(median)), priors=(Prior.of_deviation(1.0),)
+    names, prior = ("",) * len(median), Prior.of_deviation(1.0)
+    mean, part = block_of(
+        Unknown(kind="mean", names=names, start=np.zeros(len(median)), priors=(prior,)),
+        group[:, None],
+        np.full((len(group), 1), -1.0),
     )
-    part = Part(parameter=RESIDUAL, kind="mean", columns=group[:, None], values=np.full((len(group), 1), -1.0))
     layout, rows = model.build(residual, errors, (mean, *unknowns), (part, *parts), only=())
     # The likelihood has several maxima: with a moved board, shorter steps ended at one that was lower by 140.
     searches = (maximize([rows], Priors(layout), layout.start(), longer=longer) for longer in (LONGER, 2 * LONGER))

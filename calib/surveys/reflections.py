@@ -108,12 +108,12 @@ class Marks:
             more[row] = math.inf
             yield after, more
 
-    def search(self, steps: int = 40) -> Bools:
+    def search(self) -> Bools:
         """Return the marks (n,) after changes of one or two rows at a time, always the best ones, until none is an
         improvement.
         """
         here = self
-        for _ in range(steps):
+        for _ in range(40):
             after, more = min(here._neighbours(), key=lambda one: float(one[1].min()))
             if more.min() > -1e-6:
                 break

@@ -119,7 +119,7 @@ class ReflectedPair:
     chance: float
 
     @property
-    def believed(self) -> bool:
+    def likely(self) -> bool:
         """Whether it is more likely than not."""
         return self.chance >= 0.5
 
@@ -138,8 +138,8 @@ class SurveyResult(CalibrationResult):
     """The result of `survey`: a calibration, and the positions of the boards.
 
     `pair_error_m` is the constant error that a pair has in an arrangement, as a standard deviation; `verdict` states
-    which delays (in ns) are determined; `contradictions` are findings between the ranges and stated facts; `warnings`
-    are sentences for the user. `second_best` is the best other solution, `reflected` are pairs that are, or may be,
+    which delays (in ns) are determined; `findings` are contradictions between the ranges and stated facts, and limits
+    of the survey. `second_best` is the best other solution, `reflected` are pairs that are, or may be,
     reflected.
 
     >>> import calib
@@ -153,14 +153,13 @@ class SurveyResult(CalibrationResult):
     verdict: Verdict
     pair_error_m: float
     second_best: SecondBest | None
-    contradictions: tuple[Finding, ...]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     reflected: tuple[ReflectedPair, ...] = ()
 
     @property
-    def findings(self) -> tuple[str, ...]:
-        """The contradictions in words."""
-        return tuple(map(str, self.contradictions))
+    def contradictions(self) -> tuple[Finding, ...]:
+        """The findings between the ranges and stated facts."""
+        return tuple(one for one in self.findings if one.p_value is not None)
 
     def headline(self) -> str:
         """Return the inputs of the survey, in one line."""

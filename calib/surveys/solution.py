@@ -218,9 +218,7 @@ def find_reflected_means(network: Network, x: Floats, case: Case) -> tuple[Float
     return optimize(network, x, case)[0], case
 
 
-def adjust(
-    network: Network, x: Floats, *, marks: Bools | None = None, start_m: float = PAIR_STD_M, rounds: int = 6
-) -> Solution:
+def adjust(network: Network, x: Floats, *, marks: Bools | None = None, start_m: float = PAIR_STD_M) -> Solution:
     """Return the best unknowns from a start, with the spreads and the reflected means estimated alternately.
 
     `start_m` is the start value of the constant error of pairs, if this is unknown, and `marks` (n,) are the reflected
@@ -228,7 +226,8 @@ def adjust(
     """
     none = np.zeros(len(network.means.range_m), dtype=bool)
     case = Case(none if marks is None else marks, network.pair_m or start_m, CURVE_STD_M)
-    for _ in range(rounds):
+    # At most six rounds; they end if the spread changes by 2 % at most.
+    for _ in range(6):
         before = case
         x, case = find_reflected_means(network, x, case)
         case = _spreads(network, x, case)
@@ -293,7 +292,7 @@ def _average_cases(found: Solution, cases: Sequence[Case], weight: Floats) -> tu
     return mean, positive_part(wider + (around.T * weight) @ around)
 
 
-def solve(network: Network, *, moves: int = 6) -> tuple[Solution, SecondBest | None]:
+def solve(network: Network) -> tuple[Solution, SecondBest | None]:
     """Return the best solution from all starts, and the second-best."""
     start, least = first_start(network), attrgetter("unlikely")
     # With small errors of pairs too many means seem reflected at first, with large ones too few.
@@ -302,7 +301,8 @@ def solve(network: Network, *, moves: int = 6) -> tuple[Solution, SecondBest | N
     # Again with the estimated delays: the first guess of places was made without delays.
     found = min(found, adjust(network, first_start(network, found.delays)), key=least)
     worse: list[SecondBest] = []
-    for _ in range(moves):
+    # At most six moves to another solution.
+    for _ in range(6):
         here = unlikelihood(network, found.x, found.case)
         others = [other for k in range(len(network.arrangements)) for other in _other_solutions(found, k)]
         # Rounded, so that every machine chooses the same one of mirror images.

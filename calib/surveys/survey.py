@@ -18,6 +18,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from scipy import special
 from threadpoolctl import threadpool_limits
 
 from calib.calibration.model import Calibration, given_calibration
@@ -26,7 +27,7 @@ from calib.data.ranges import Ranges
 from calib.data.samples import ANCHOR_DELAYS_NS
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
-from calib.findings import BUDGET, Finding
+from calib.findings import BUDGET, Finding, warning
 from calib.settings import SurveySettings
 from calib.surveys.knowledge import Knowledge, check_knowledge, load_knowledge
 from calib.surveys.network import DIMENSIONS, Boards, CurvePrior, Network
@@ -34,6 +35,7 @@ from calib.surveys.outcome import in_frames, result_of, widened_by
 from calib.surveys.recordings import LIFT, SurveyData, read_surveys
 from calib.surveys.result import SurveyResult
 from calib.surveys.solution import Solution, adjust, averaged, exchanged_boards, first_start, out_of_order, solve
+from uwblink.arrays import Floats
 from uwblink.recording.schema import SHAPES
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -41,12 +43,15 @@ from uwblink.ticks import SPEED_OF_LIGHT
 def likeliest_fault(found: Solution) -> tuple[Finding, Solution] | None:
     """Return the likeliest fault that chance does not explain, and the solution without it."""
     tried = [
-        (Finding(fault, text, remedy, math.exp(min(0.5 * (without.unlikely - found.unlikely), 0.0))), without)
-        for fault, (hypotheses, remedy) in HYPOTHESES.items()
+        (fault, text, without, math.exp(min(0.5 * (without.unlikely - found.unlikely), 0.0)))
+        for fault, hypotheses in HYPOTHESES.items()
         for text, without in hypotheses(found)
     ]
-    likely = (one for one in tried if one[0].p_value < BUDGET)
-    return min(likely, key=lambda one: one[1].unlikely, default=None)
+    likely = [one for one in tried if one[3] < BUDGET]
+    if not likely:
+        return None
+    fault, text, without, p_value = min(likely, key=lambda one: one[2].unlikely)
+    return warning(fault, text, p_value), without
 
 
 def _distances(found: Solution) -> Iterator[tuple[str, Solution]]:
@@ -119,14 +124,11 @@ def _exchanged(found: Solution) -> Iterator[tuple[str, Solution]]:
 
 
 HYPOTHESES = {
-    "wrong known distance": (_distances, "measure the distance again or leave it out"),
-    "arrangement not as it is said to be": (
-        _shapes,
-        "move the boards to the known shape, or remove it from the known facts",
-    ),
-    "exchanged labels": (_exchanged, "check the labels of these two boards"),
+    "wrong known distance": _distances,
+    "arrangement not as it is said to be": _shapes,
+    "exchanged labels": _exchanged,
 }
-"""The checks by fault: the hypotheses, and the remedy if one is true."""
+"""The hypotheses by fault."""
 
 
 def wrong_orders(found: Solution) -> Iterator[Finding]:
@@ -135,11 +137,12 @@ def wrong_orders(found: Solution) -> Iterator[Finding]:
     A common contradiction of several arrangements is one contradiction.
     """
     network, points = found.network, found.network.positions_m(found.x)
-    spots = {}
+    spots, chances, covariance = {}, {}, found.covariance()
     for k in out_of_order(network, found.x):
-        order = network.arrangements[k].order
-        along = points[[network.points[k, tag] for tag in order], 0]
+        seats = np.array([network.points[k, tag] for tag in network.arrangements[k].order])
+        along = points[seats, 0]
         spots[k] = along if np.corrcoef(np.arange(len(along)), along)[0, 1] > 0 else -along
+        chances[k] = _chance_of_order(spots[k], covariance[np.ix_(3 * seats, 3 * seats)])
     pairs = {k: exchanged_boards(network.arrangements[k].order, along) for k, along in spots.items()}
     while pairs:
         common = Counter(pair for some in pairs.values() for pair in sorted(some))
@@ -155,7 +158,17 @@ def wrong_orders(found: Solution) -> Iterator[Finding]:
             f"{where}: {what}: the stated order is {'-'.join(map(str, stated))}, but by the ranges of "
             f"{network.arrangements[same[0]].name} it is {'-'.join(map(str, seen))}"
         )
-        yield Finding("exchanged labels", text, "check their labels", BUDGET)
+        yield warning("exchanged labels", text, chances[same[0]])
+
+
+def _chance_of_order(along_m: Floats, covariance_m2: Floats) -> float:
+    """Return the probability that the two boards (n,) that are farthest out of order are in order, by their
+    covariance (n, n).
+    """
+    back_m = np.triu(np.subtract.outer(along_m, along_m), 1)
+    i, j = np.unravel_index(int(np.argmax(back_m)), back_m.shape)
+    variance = covariance_m2[i, i] + covariance_m2[j, j] - 2 * covariance_m2[i, j]
+    return float(special.ndtr(-back_m[i, j] / math.sqrt(max(variance, 1e-12))))
 
 
 def survey(data: Data | Iterable[Data], settings: SurveySettings | None = None, **changes: Any) -> SurveyResult:
@@ -225,14 +238,15 @@ def _checked_curve(curve_from: Calibration | str | os.PathLike[str] | None) -> C
 
 
 def _less_curve(gathered: SurveyData, curve: Curve) -> SurveyData:
-    """Return the means minus a curve, with a warning about powers outside its fitted range."""
+    """Return the means minus a curve, with a finding about powers outside its fitted range."""
     means = gathered.means
     if not np.isfinite(means.lifted).all():
         raise UnanswerableError("some pairs have no power, so no curve can be applied (`curve_from`)")
     beyond = int(np.count_nonzero(~curve.inside(means.lifted)))
-    more = (f"{beyond} pairs have powers outside the fitted powers of the given curve",) if beyond else ()
+    text = f"{beyond} pairs have powers outside the fitted powers of the given curve"
+    more = (warning("powers outside those of the curve", text),) if beyond else ()
     less = replace(means, range_m=means.range_m - curve(means.lifted))
-    return replace(gathered, means=less, warnings=(*gathered.warnings, *more))
+    return replace(gathered, means=less, limits=(*gathered.limits, *more))
 
 
 def network_of(gathered: SurveyData, knowledge: Knowledge, fixed_ns: Mapping[int, float], *, curve: bool) -> Network:

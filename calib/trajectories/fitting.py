@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
-from scipy import sparse
+from scipy import sparse, special
 from threadpoolctl import threadpool_limits
 
 from calib.calibration.document import Split
@@ -26,6 +26,7 @@ from calib.estimator.rows import sum_rows
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
 from calib.estimator.unknowns import Layout
+from calib.findings import Finding, warning
 from calib.fitting.fitting import fitted_quantities, result_of
 from calib.fitting.result import FitResult
 from calib.information import LOOSEST, InformationColumn, Verdict, judge
@@ -199,7 +200,12 @@ def _result(
         provenance=provenance,
     )
     unsettled = f"the fit stopped after {top.steps} steps before it converged: delays are not final"
-    notes = [left_open, "" if top.optimum.success else unsettled, rival, *scene.tapes.left_out]
+    limits = [
+        ("undetermined delays", left_open),
+        ("not converged", "" if top.optimum.success else unsettled),
+        ("second solution", rival),
+        *(("unused known distance", text) for text in scene.tapes.left_out),
+    ]
     return result_of(
         found,
         calibration,
@@ -207,7 +213,7 @@ def _result(
         findings,
         settings=settings,
         fixed=fixed,
-        first=[note for note in notes if note],
+        first=[warning(fault, text) for fault, text in limits if text],
         more=(*_of_motion(top), *_of_tapes(top)),
     )
 
@@ -330,17 +336,18 @@ def verdict_on(covariance: Floats, with_truth: Floats, tags: Sequence[int]) -> V
     return judge((information + information.T) / 2, unknowns)
 
 
-def _of_motion(top: Search) -> Iterator[str]:
+def _of_motion(top: Search) -> Iterator[Finding]:
     missed_m = top.missed_motion_m()
     if missed_m:
-        yield (
+        yield warning(
+            "motion faster than the trajectory",
             f"bodies move too fast for control points every {top.motion.places.step_s:.1f} s: trajectories and "
-            f"distances have errors of about {100 * missed_m:.0f} cm; fly more slowly"
+            f"distances have errors of about {100 * missed_m:.0f} cm",
         )
 
 
-def _of_tapes(top: Search) -> Iterator[str]:
-    """Yield a sentence for each tape that the ranges contradict, by deleted residuals (Cook and Weisberg 1982).
+def _of_tapes(top: Search) -> Iterator[Finding]:
+    """Yield a finding for each tape that the ranges contradict, by deleted residuals (Cook and Weisberg 1982).
 
     These are beyond four standard errors and three centimetres.
     """
@@ -359,8 +366,10 @@ def _of_tapes(top: Search) -> Iterator[str]:
         without = float(left[mine].mean()) / free
         deviation = abs(without) * math.sqrt(free) / one.sigma_m
         if deviation >= 4.0 and abs(without) >= 0.03:
-            yield (
+            yield warning(
+                "wrong known distance",
                 f"the distance of tags {one.first} and {one.second}, {one.distance_m:.3f} m, is "
                 f"{100 * abs(without):.0f} cm {'more' if without > 0 else 'less'} than by all other data "
-                f"({deviation:.0f} standard errors): measure it again"
+                f"({deviation:.0f} standard errors)",
+                min(1.0, len(tapes.stated) * 2 * float(special.ndtr(-deviation))),
             )

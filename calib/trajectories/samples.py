@@ -137,7 +137,7 @@ def tapes_of(
         if not times:
             left_out.append(
                 f"the distance of tags {one.first} and {one.second} is not used, because it is unknown when its "
-                f"bodies stood still; give an arrangement or its seconds"
+                f"bodies stood still"
             )
             continue
         std_m = one.sigma_m * np.sqrt(len(times))
@@ -320,9 +320,10 @@ def _carried_on(readings: Readings, first: int, attitude: Floats, bias: Floats) 
     return np.asarray(Rotation.from_matrix(found).as_quat())
 
 
-def _gyro_bias(readings: Readings, known: Attitude, until_s: float, step_s: float = 0.5) -> Floats:
+def _gyro_bias(readings: Readings, known: Attitude, until_s: float) -> Floats:
     """Return the bias of the gyroscope (3,), rad/s: the median of its readings minus the known turn rates, which are
-    means over `step_s`."""
+    means over half a second."""
+    step_s = 0.5
     last = min(until_s, float(known.time_s[-1]), float(readings.time_s[-1]))
     edges = np.arange(max(float(known.time_s[0]), float(readings.time_s[0])), last, step_s)
     slot = np.searchsorted(edges, readings.time_s, side="right") - 1

@@ -183,7 +183,7 @@ def _second_solution(scene: Scene, best: MotionFit, tried: list[MotionFit], time
             what = f"{scene.moving[int(np.argmax(away))]} {away.max():.1f} m away" if given else "other distances"
             return (
                 f"a second solution, with {what}, fits the first {time[-1] - time[0]:.0f} s as well: the delays may "
-                f"belong to the wrong one; anchors that are not in one plane, heights, or a known start resolve this"
+                f"belong to the wrong one"
             )
     return ""
 
@@ -222,9 +222,8 @@ def _initial_anchors(scene: Scene, seed: Trajectories) -> Floats:
     window = scene.between(float(seed.time_s[0]), float(seed.time_s[-1]))
     rng = np.random.default_rng(0)
     here, sought = seed.position_m.reshape(-1, 3), scene.sought
-    ends = np.column_stack([window.ranges.initiator, window.ranges.target])
     tags = [[tag for tag, (body, _) in scene.arms.items() if body == name] for name in sought]
-    mine = np.array([np.isin(ends, own).any(axis=1) for own in tags], dtype=np.float64)
+    mine = np.array([np.isin(window.ranges.ends, own).any(axis=1) for own in tags], dtype=np.float64)
     starts = rng.normal(here.mean(axis=0), here.std(axis=0) + START_SPREAD_M, (START_COUNT // 3, len(sought), 3))
     fits = [_fit_window(window, seed, start) for start in starts]
     cost = [mine @ np.log1p((one.residuals / SCALES_M[-1]) ** 2) for one in fits]
@@ -264,6 +263,6 @@ def resolve_headings(scene: Scene, state: State) -> tuple[Scene, State, str]:
             break
     text = (
         f"a second solution, with another heading of {', '.join(unsure)}, fits as well: the delays may belong to the "
-        f"wrong one; attitudes or a known start resolve this"
+        f"wrong one"
     )
     return scene.turned_by(heading), best.state, text if unsure else ""

@@ -27,6 +27,7 @@ PAGES: Final[dict[str, Callable[[], str]]] = {
     "sweep": lambda: schema.reference(SweepFile.model_json_schema(), "SweepFile"),
     "calibration": lambda: file_keys.reference(CALIBRATION),
     "checks": checks.reference,
+    "warnings": checks.warnings,
     "uwbsim": lambda: commands.reference(uwbsim_app, "uwbsim"),
     "uwblink": lambda: commands.reference(uwblink_app, "uwblink"),
     "calib": lambda: commands.reference(calib_app, "calib"),

@@ -1,4 +1,4 @@
-"""The table of the doctor's checks, out of the code that makes them."""
+"""The tables of the doctor's checks and of the findings of fits, out of the code that makes them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 from typing import Final
 
 from calib.checks.examine import CHECKS
+from calib.findings import REMEDIES
 
 HEAD: Final = "| question | statistic; distribution on sound data | faults, and what to do |\n|---|---|---|"
 
@@ -18,6 +19,12 @@ def reference() -> str:
         for check in CHECKS
     ]
     return "\n".join([HEAD, *rows])
+
+
+def warnings() -> str:
+    """Return the Markdown of the findings of fits and surveys, with their remedies."""
+    rows = [f"| {fault} | {_plain(remedy)} |" for fault, remedy in REMEDIES.items()]
+    return "\n".join(["| finding | what to do |\n|---|---|", *rows])
 
 
 def _plain(remedy: str) -> str:

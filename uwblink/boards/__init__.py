@@ -15,7 +15,7 @@ from typing import Any
 from uwblink.boards.dialects import DIALECTS, Dialect, PrintedRange, dialect_of, printed_ranges, record_printed
 from uwblink.boards.listeners import Heard, Progress, delays_warning, load_correction
 from uwblink.boards.live_page import LivePage
-from uwblink.boards.ports import Terminal, boards_ports, serial_number, wait_until
+from uwblink.boards.ports import boards_ports, open_terminals, serial_number, wait_until
 from uwblink.boards.ranging_plan import load_plan
 from uwblink.boards.record import append_rows
 from uwblink.corrections import Correction
@@ -133,7 +133,6 @@ def play(
     *,
     speed: float = 1.0,
     link_dir: Path | None = None,
-    stop: Callable[[], bool] = lambda: False,
 ) -> int:
     """Play the bytes from boards back on one pseudo-terminal each; returns how many frames were played.
 
@@ -143,13 +142,14 @@ def play(
     frames = _bytes_from_boards(recording)
     ids = board_ids(recording)
     names = sorted({frame.board for frame in frames})
-    terminals = {n: Terminal(link_dir / f"tag{ids.get(n, k)}" if link_dir else None) for k, n in enumerate(names)}
+    terminals = open_terminals(
+        {name: link_dir / f"tag{ids.get(name, k)}" if link_dir else None for k, name in enumerate(names)}
+    )
     try:
         ready({name: terminal.name for name, terminal in terminals.items()})
         start_s, first_ns = time.monotonic(), frames[0].time_ns
-        for count, frame in enumerate(frames):
-            if not wait_until(start_s + (frame.time_ns - first_ns) * 1e-9 / speed, stop):
-                return count
+        for frame in frames:
+            wait_until(start_s + (frame.time_ns - first_ns) * 1e-9 / speed, lambda: False)
             terminals[frame.board].write(frame.data)
         return len(frames)
     finally:

@@ -22,7 +22,7 @@ from uwblink.boards.ports import Ports, SerialPorts, Transport
 from uwblink.boards.record import RecordingWriter
 from uwblink.database import connect
 from uwblink.errors import ArgumentError, BoardError, PlanError
-from uwblink.importers.column_map import ColumnMap, load_map, map_of_lines
+from uwblink.importers.column_map import ColumnMap, load_map
 from uwblink.importers.devices import LINES
 from uwblink.importers.staging import numbers_of, staged_cells
 from uwblink.importers.tables import SourceTable
@@ -100,7 +100,9 @@ _START: Final = {"dwm1001-lec": b"\r\rlec\r", "dwm1001-les": b"\r\rles\r"}
 DIALECTS: Final[Registry[Dialect]] = Registry(
     "dialect",
     "uwbcal.dialects",
-    tuple(Dialect(name, LINES[name]["line"], parser_of(map_of_lines(name)), _START.get(name, b"")) for name in LINES),
+    tuple(
+        Dialect(name, form["line"], parser_of(ColumnMap(**form)), _START.get(name, b"")) for name, form in LINES.items()
+    ),
     partial(
         check_row,
         "dialect",

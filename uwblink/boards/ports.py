@@ -11,10 +11,10 @@ import errno
 import os
 import select
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Final, Protocol, Self
+from typing import Any, Final, Protocol, Self, TypeVar
 
 import serial
 from serial.tools import list_ports
@@ -28,6 +28,8 @@ try:
 except ImportError:  # pragma: no cover - Windows has no pseudo-terminals
     pty = None  # type: ignore[assignment]
 
+
+Key = TypeVar("Key")
 
 POLL_S: Final = 0.002
 """Longest wait at a port without a descriptor before other ports are read; an exchange takes 4 ms."""
@@ -266,6 +268,8 @@ class Terminal:
         """Open the port, unless it is open."""
         if self._ends:
             return
+        if self._link:
+            _free(self._link)
         # The client's end is also kept open here: otherwise reads fail if no client has it open.
         near, far = pty.openpty()
         tty.setraw(far)
@@ -300,11 +304,35 @@ class Terminal:
         self.lost_bytes += len(data) - sent
 
 
+def open_terminals(links: Mapping[Key, Path | None]) -> dict[Key, Terminal]:
+    """Open a pseudo-terminal for each key, with its link or without; raises `PortError`, and no link remains then.
+
+    Links of a server that was killed are all removed first, because the system uses the names of terminals again: a
+    link that remains could lead to a terminal that is opened here for another key.
+    """
+    for link in filter(None, links.values()):
+        _free(link)
+    opened: dict[Key, Terminal] = {}
+    try:
+        for key, link in links.items():
+            opened[key] = Terminal(link)
+    except BaseException:
+        for terminal in opened.values():
+            terminal.unplug()
+        raise
+    return opened
+
+
+def _free(link: Path) -> None:
+    """Remove the link of a server that was killed; raises `PortError` if it leads to a port."""
+    if link.is_symlink():
+        if link.exists():
+            raise PortError(f"{link}: is a port in use by another server; choose another folder, or remove the link")
+        with raising(PortError, f"{link}: cannot be removed"):
+            link.unlink()
+
+
 def _point(link: Path, device: str) -> None:
-    if link.is_symlink() and link.exists():
-        raise PortError(f"{link}: is a port in use by another server; choose another folder, or remove the link")
     with raising(PortError, f"{link}: cannot be made a link to {device}"):
         link.parent.mkdir(parents=True, exist_ok=True)
-        if link.is_symlink():  # remains of a server that was killed
-            link.unlink()
         link.symlink_to(device)

@@ -149,12 +149,11 @@ def _meta(found: Mapping[int, str], plan: RangingPlan, turns: Iterable[Pair], pa
     }
 
 
-def identify(names: Iterable[str], ports: Ports | None = None) -> dict[int, str]:
+def identify(names: Iterable[str], ports: Ports) -> dict[int, str]:
     """Return the port of each board by id; raises `PlanError` if two have one id, and what `Board.open` raises."""
-    using = ports or SerialPorts()
     found: dict[int, str] = {}
     for name in names:
-        with Board(using.open(name)) as board:
+        with Board(ports.open(name)) as board:
             number = board.id
         if number in found:
             raise PlanError(f"{found[number]} and {name} both have the id {number}; ids must differ")

@@ -13,7 +13,7 @@ from typing import Final
 
 from uwblink.boards.board import FENCE, QUIET_AFTER_CIR_S, QUIET_TARGET_S, Board, CommandOutcome, Connection
 from uwblink.boards.listeners import Heard, Listener, Pair, PairState, Progress, ReportCheck, Turn
-from uwblink.boards.ports import Closing, Ports, SerialPorts, Transport, serial_number
+from uwblink.boards.ports import Closing, Ports, Transport, serial_number
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.errors import BoardError, PortError, PortLostError
 from uwblink.recording.schema import Fault
@@ -97,10 +97,10 @@ class Recorder(Closing):
         listeners: Iterable[Listener],
         *,
         passive: bool = False,
-        ports: Ports | None = None,
+        ports: Ports,
     ) -> None:
         """Open the ports of boards; raises `PortError`."""
-        self._ports = ports or SerialPorts()
+        self._ports = ports
         self._plan, self._turns, self._passive = plan, tuple(turns), passive
         self._start_s = self._ports.now_s()
         self._turn, self._next_s, self._quiet_until_s = 0, self._start_s, 0.0

@@ -7,7 +7,7 @@ import math
 import os
 import statistics
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -46,7 +46,7 @@ from uwblink.errors import PlanError, RangingFailedError, RecordingError, Refuse
 from uwblink.output import check_output
 
 if TYPE_CHECKING:
-    from uwblink.boards import Correction, Progress
+    from uwblink.boards import Correction, Dialect, Progress
     from uwblink.wire import RangeReport
 
 
@@ -306,7 +306,6 @@ def record(
     delays are those of --antenna-delays or of the plan; by default 16436 ticks in each board.
     """
 
-    check_output(output, force=force, recording=True)
     _check_dialect(
         dialect,
         ids,
@@ -326,28 +325,35 @@ def record(
         raise PlanError(f"--pairs: found {pairs!r}, expected all or none; a plan file can name pairs")
     if calibration and not live:
         raise PlanError("--calibration: corrected ranges are only shown on the live page; add --live")
-    chosen = _plan(plan, antenna_delays, "all" if pairs == "all" else (), rate_hz=rate, get_cir=cir)
+    check_output(output, force=force, recording=True)
+    chosen = _plan(dialect, plan, antenna_delays, "all" if pairs == "all" else (), rate_hz=rate, get_cir=cir)
+    options = {"passive": passive, "arrangement": arrangement, "known": known, "order": _ids(order, "order")}
     with ExitStack() as stack:
-        stop, watch = stack.enter_context(interrupts()), stack.enter_context(_watcher())
+        stop, watchers = stack.enter_context(interrupts()), [stack.enter_context(_watcher())]
         pages = []
         if live:
-            correct = _correction(calibration, chosen if dialect is None else None)
+            correct = _correction(calibration, chosen)
             pages.append(stack.enter_context(uwblink.boards.LivePage(output, correct=correct, port=live_port)))
             typer.echo(f"live page: {pages[0].url}", err=True)
-
-        def watch_all(progress: Progress) -> None:
-            for show in (watch, *(page.watch for page in pages)):
-                show(progress)
-
-        how: dict[str, Any] = {"duration_s": duration or math.inf, "force": force, "stop": stop}
-        how |= {"watch": watch_all, "listeners": pages}
-        if dialect is not None:
-            spoken = uwblink.boards.dialect_of(dialect)
-            progress: Progress = uwblink.boards.record_printed(ports, output, spoken, ids=_ids(ids, "ids"), **how)
-        else:
-            arranged: dict[str, Any] = {"arrangement": arrangement, "known": known, "order": _ids(order, "order")}
-            progress = uwblink.record(ports, output, chosen, passive=passive, **arranged, **how)
+            watchers.append(pages[0].watch)
+        how: dict[str, Any] = {"duration_s": duration or math.inf, "force": force, "stop": stop, "listeners": pages}
+        how["watch"] = lambda progress: [watch(progress) for watch in watchers]
+        progress = _record(ports, output, chosen, ids, how, options)
     typer.echo(f"{output}: {progress}")
+
+
+def _record(
+    ports: list[str],
+    output: Path,
+    chosen: uwblink.RangingPlan | Dialect,
+    ids: str,
+    how: Mapping[str, Any],
+    of_plan: Mapping[str, Any],
+) -> Progress:
+    """Record from boards that execute a plan, or that print ranges in a dialect."""
+    if isinstance(chosen, uwblink.RangingPlan):
+        return uwblink.record(ports, output, chosen, **how, **of_plan)
+    return uwblink.boards.record_printed(ports, output, chosen, ids=_ids(ids, "ids"), **how)
 
 
 def stream(
@@ -396,56 +402,53 @@ def stream(
             f"not with a recording"
         )
     _check_dialect(dialect, ids, plan=plan, rate=rate, antenna_delays=antenna_delays, use=use == "receptions")
-    seen, count = uwblink.boards.Progress(), 0
-    senders: list[Callable[[uwblink.StreamedRange], object]] = []
-
-    def send_on(found: uwblink.StreamedRange | uwblink.streaming.StreamedDifference) -> None:
-        nonlocal count
-        if not quiet:
-            typer.echo(found.to_json())
-        if isinstance(found, uwblink.StreamedRange):
-            count += 1
-            for send in senders:
-                send(found)
-
+    seen = uwblink.boards.Progress()
     with ExitStack() as stack:
-        stop = stack.enter_context(interrupts())
-        if udp is not None:
-            senders.append(stack.enter_context(uwblink.streaming.UdpSender(udp)).send)
-        if foxglove is not None:
-            server = stack.enter_context(uwblink.streaming.FoxgloveServer(foxglove))
-            typer.echo(f"foxglove: {server.url}", err=True)
-            senders.append(server.send)
-        spoken = None if dialect is None else uwblink.boards.dialect_of(dialect)
-        chosen = _plan(plan, antenna_delays, rate_hz=rate) if of_boards and not spoken else None
+        stop, sink = stack.enter_context(interrupts()), _Sink(stack, udp=udp, foxglove=foxglove, quiet=quiet)
+        chosen = _plan(dialect, plan, antenna_delays, rate_hz=rate) if of_boards else None
         correct = _correction(calibration, chosen, None if of_boards else source[0])
         how: dict[str, Any] = {"duration_s": duration or math.inf, "stop": stop}
-        how |= {"ids": _ids(ids, "ids")} if spoken else {}
-        told: dict[str, Any] = {
-            "listeners": [seen, uwblink.streaming.RangeListener(send_on, correct, use)],
-            "force": force,
-        }
         try:
-            if output and spoken:
-                uwblink.boards.record_printed(source, output, spoken, **how, **told)
-            elif output and chosen:
-                uwblink.record(source, output, chosen, passive=use == "receptions", **how, **told)
+            if output and chosen:
+                how["listeners"] = [seen, uwblink.streaming.RangeListener(sink.send, correct, use)]
+                _record(source, output, chosen, ids, how | {"force": force}, {"passive": use == "receptions"})
             else:
-                how |= {"calibration": correct}
-                ranges = (
-                    uwblink.streaming.stream_printed(source, spoken, **how)
-                    if spoken
-                    else uwblink.stream(
-                        source if of_boards else source[0], use=use, plan=chosen, speed=speed, listeners=[seen], **how
-                    )
-                )
+                how["calibration"] = correct
+                if chosen is None:
+                    ranges = uwblink.stream(source[0], use=use, speed=speed, **how)
+                elif isinstance(chosen, uwblink.RangingPlan):
+                    ranges = uwblink.stream(source, use=use, plan=chosen, listeners=[seen], **how)
+                else:
+                    ranges = uwblink.streaming.stream_printed(source, chosen, ids=_ids(ids, "ids"), **how)
                 stack.callback(ranges.close)
                 for found in ranges:
-                    send_on(found)
+                    sink.send(found)
         except BrokenPipeError:
             # The reader of the lines closed, which ends the stream; Python must not write the rest at its end.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    typer.echo(f"{count} ranges" + (f"; faults: {seen.fault_counts()}" if seen.faults else ""), err=True)
+    typer.echo(f"{sink.count} ranges" + (f"; faults: {seen.fault_counts()}" if seen.faults else ""), err=True)
+
+
+class _Sink:
+    """Prints what a stream yields, and sends its ranges to other programs; `count` is the number of ranges."""
+
+    def __init__(self, stack: ExitStack, *, udp: str | None, foxglove: str | None, quiet: bool) -> None:
+        self.count, self._quiet = 0, quiet
+        self._senders: list[Callable[[uwblink.StreamedRange], object]] = []
+        if udp is not None:
+            self._senders.append(stack.enter_context(uwblink.streaming.UdpSender(udp)).send)
+        if foxglove is not None:
+            server = stack.enter_context(uwblink.streaming.FoxgloveServer(foxglove))
+            typer.echo(f"foxglove: {server.url}", err=True)
+            self._senders.append(server.send)
+
+    def send(self, found: uwblink.StreamedRange | uwblink.streaming.StreamedDifference) -> None:
+        if not self._quiet:
+            typer.echo(found.to_json())
+        if isinstance(found, uwblink.StreamedRange):
+            self.count += 1
+            for send in self._senders:
+                send(found)
 
 
 def _check_dialect(dialect: str | None, ids: str, **others: Any) -> None:
@@ -460,12 +463,18 @@ def _check_dialect(dialect: str | None, ids: str, **others: Any) -> None:
 
 
 def _plan(
-    path: Path | None, antenna_delays: Path | None, pairs: Literal["all"] | tuple[()] = "all", **options: Any
-) -> uwblink.RangingPlan:
-    """Return the plan of a file, or one for `pairs`, with the `options` that are given.
+    dialect: str | None,
+    path: Path | None,
+    antenna_delays: Path | None,
+    pairs: Literal["all"] | tuple[()] = "all",
+    **options: Any,
+) -> uwblink.RangingPlan | Dialect:
+    """Return what boards do: print ranges in a dialect, or execute the plan of a file, or one for `pairs`.
 
-    Raises `PlanError` if antenna delays are given twice.
+    A plan gets the `options` that are given. Raises `PlanError` if antenna delays are given twice.
     """
+    if dialect is not None:
+        return uwblink.boards.dialect_of(dialect)
     chosen = uwblink.boards.load_plan(path) if path else uwblink.RangingPlan(pairs)
     if antenna_delays and chosen.antenna_delays:
         raise PlanError(
@@ -476,12 +485,16 @@ def _plan(
     return replace(chosen, **{name: value for name, value in options.items() if value})
 
 
-def _correction(path: Path | None, plan: uwblink.RangingPlan | None, recording: str | None = None) -> Correction | None:
+def _correction(
+    path: Path | None, chosen: uwblink.RangingPlan | Dialect | None, recording: str | None = None
+) -> Correction | None:
     """Return the correction of a calibration, and warn if its antenna delays differ from those of the ranges."""
     if path is None:
         return None
     correct = uwblink.boards.load_correction(path)
-    warning = uwblink.boards.delays_warning(correct, plan.delays()) if plan else ""
+    warning = ""
+    if isinstance(chosen, uwblink.RangingPlan):
+        warning = uwblink.boards.delays_warning(correct, chosen.delays())
     if recording is not None:
         with uwblink.Recording.open(recording) as opened:
             delays, tags = uwblink.recording.delays_in_meta(opened.meta()), [one.tag for one in opened.tags()]

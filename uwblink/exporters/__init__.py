@@ -179,6 +179,9 @@ def check_export(folder: str | os.PathLike[str], *, to: str, force: bool) -> Non
     if to not in EXPORTERS:
         raise ArgumentError(f"found {to!r:.40}, allowed: {', '.join(EXPORTERS)}", parameter="to")
     check_name(final)
+    if final.name in ("", "..") and final.is_dir():  # a new folder cannot take such a name
+        example = final / "tables"
+        raise RecordingExistsError(f"{final}: is an existing folder; name a new folder for the export, as in {example}")
     if final.exists() and (not force or not final.is_dir()):
         raise RecordingExistsError(f"{final}: already exists; give another name, or replace it with `force`")
     if not final.parent.is_dir():

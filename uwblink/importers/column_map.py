@@ -307,12 +307,6 @@ JSON_LINE: Final = "{json}"
 """The `line` of logs whose lines end with an object of JSON."""
 
 
-def map_of_lines(name: str) -> ColumnMap:
-    """Return the map of a form of `LINES`."""
-    known = LINES[name]
-    return ColumnMap(line=known["line"], each=known.get("each"), wide=known.get("wide", {}), units=known["units"])
-
-
 def load_map(path: Path) -> ColumnMap:
     """Read a map; raises `ImportTableError` that names the key."""
     file = TomlReader(path, ImportTableError, "map")

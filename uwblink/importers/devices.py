@@ -107,4 +107,4 @@ LINES: Final[dict[str, dict[str, Any]]] = {
     "trek-corrected": {"line": f"mc{_REPORT}", "wide": {"range_m": "r{to_id}"}, "units": {"distance": "mm"}},
     "trek-raw": {"line": f"mr{_REPORT}", "wide": {"range_m": "r{to_id}"}, "units": {"distance": "mm"}},
 }
-"""Keys of a map by the name of a form; the first match is used, so longer forms are first."""
+"""Fields of `ColumnMap` by the name of a form; the first match is used, so longer forms are first."""

@@ -26,7 +26,6 @@ from uwblink.importers.column_map import (
     TIME_UNITS,
     UNITS_BY_KEY,
     ColumnMap,
-    map_of_lines,
 )
 from uwblink.importers.devices import LINES
 from uwblink.importers.plausibility import MIN_ROWS, reason_against_dbm, reason_against_metres
@@ -211,7 +210,7 @@ def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
     if not found:
         return None
     name, matches = next(iter(found.items()))
-    form, line = map_of_lines(name), LINES[name]["line"]
+    form, line = ColumnMap(**LINES[name]), LINES[name]["line"]
     leads = [match.string[: match.start()] for match in matches]
     time = r"\W*?([0-9]+(?:\.[0-9]+)?|[0-9]{4}-[0-9-]{5}[ T][0-9:.,]+Z?|[0-9]+:[0-9]{2}:[0-9.]+)(\W+)"
     times = [re.fullmatch(time, lead) for lead in leads]

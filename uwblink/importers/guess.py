@@ -261,11 +261,14 @@ def _proposal(
         raise ImportTableError(f"{path}: no column whose name is known, or no rows; there are {', '.join(names)}")
     missing: dict[float, float] = {}
     for name in ("range_m", "gt_range_m"):
-        missing |= sentinels(cells[name]) if name in cells else {}
-        cells |= {name: np.where(np.isin(cells[name], list(missing)), np.nan, cells[name])} if name in cells else {}
+        if name in cells:
+            missing |= sentinels(cells[name])
+            cells[name] = np.where(np.isin(cells[name], list(missing)), np.nan, cells[name])
     words = {name for name, column in cells.items() if not np.isfinite(column).any()}
     known = (one for one, (needed, *_) in _LAYOUTS.items() if one != "stamps" and {*needed} <= cells.keys())
     layout = "stamps" if "event" in columns else next(known)
+    if layout == "nothing" and {"qw", "qx", "qy", "qz"} <= {name.lower() for name in names}:
+        raise ImportTableError(f"{path}: contains poses, not ranges; add them to a recording with `uwblink poses`")
     needed, foreign, why = _LAYOUTS[layout]
     if layout == "messages" and "message" in words and columns["message"] != "message":
         del columns["message"], cells["message"]  # without a column of that name the order of messages is used
@@ -282,22 +285,20 @@ def _proposal(
     registers = {(ours if layout == "messages" else f"{ours}2"): keys for ours, keys in registers.items()}
     registers = {ours: keys for ours, keys in registers.items() if ours not in columns}
     top |= {"chip": (ASKED, "powers from registers: write dw1000 or dw3000"), "prf": (64, "MHz")} if registers else {}
-    constants: Entries = {
-        name: (
-            ASKED,
-            f"no column was recognised as {ALL_IDS[name]}: write a number or a word for all rows, or the column above",
-        )
-        for name in (ALL_IDS if layout == "differences" else IDS)
-        if name not in columns
+    used = {name: header for name, header in columns.items() if name not in foreign}
+    sections: dict[str, Entries] = {
+        "": top,
+        "columns": _named(layout, used, given, words, names) | {ours: (keys, "") for ours, keys in registers.items()},
+        "wide": {ours: (stated, "") for ours, stated in form.wide.items()},
+        "units": units,
+        "constants": _constants(layout, columns),
+        "antenna_delays": _NO_DELAYS if undelayed else {},
     }
-    if layout == "nothing" and {"qw", "qx", "qy", "qz"} <= {name.lower() for name in names}:
-        raise ImportTableError(f"{path}: contains poses, not ranges; add them to a recording with `uwblink poses`")
     lacking = [name for name in needed if name not in cells or name in words]
     lacking += ["message"] if layout == "messages" and "message" in words & cells.keys() else []
     unplaced = [name for name in POSITIONS if name not in columns]
-    used = {header for name, header in columns.items() if name not in foreign}
-    used |= {header for keys in registers.values() for header in keys.values()}
-    left = [json.dumps(name) for name in names if name not in used and not form.line and not form.wide]
+    taken = {*used.values(), *(header for keys in registers.values() for header in keys.values())}
+    left = [json.dumps(name) for name in names if name not in taken and not form.line and not form.wide]
     remarks = {
         why: layout == "nothing",
         "antenna delays programmed into the devices are unknown: give them in [antenna_delays]": not undelayed,
@@ -305,29 +306,41 @@ def _proposal(
         f"not used: {', '.join(left)[:300]}": left,
         f"a column of numbers is still needed: {', '.join(lacking)}": lacking,
     }
-    named: Entries = {
-        name: (header, "") for name, header in columns.items() if name not in foreign and name not in given
-    }
-    if layout == "nothing" and not {*STAMPS} & cells.keys():
-        named["range_m"] = (ASKED, "write the column of the ranges; or delete this line, and name those of stamps")
-    elif layout == "ranges" and "range_m" in named and (others := _kinds_of_range(columns["range_m"], names)):
-        named["range_m"] = (
-            ASKED,
-            f"write the column that the device measured: {' or '.join(json.dumps(one) for one in others)}",
-        )
-    if "gt_range_m" in words and "gt_range_m" in named:
-        named["gt_range_m"] = (
-            ASKED,
-            f"{json.dumps(columns['gt_range_m'])} has no numbers: name a column, or delete the line",
-        )
-    named |= {ours: (keys, "") for ours, keys in registers.items()}
-    none: Entries = {"tx": (0, "according to the true distances, none were programmed into the devices"), "rx": (0, "")}
-    wide: Entries = {ours: (stated, "") for ours, stated in form.wide.items()}
-    sections = {"columns": named, "wide": wide, "units": units, "constants": constants}
-    sections |= {"antenna_delays": none if undelayed else {}}
-    asked = [key for part in (constants, top, named, units) for key, (value, _) in part.items() if value == ASKED]
-    text = _text(path, {"": top, **sections}, [text for text, is_due in remarks.items() if is_due])
+    text = _text(path, sections, [text for text, is_due in remarks.items() if is_due])
+    asked = (name for title in ("constants", "", "columns", "units") for name in _asked(sections[title]))
     return Guess(text, layout != "nothing" and not lacking, tuple(asked), tuple(columns))
+
+
+_NO_DELAYS: Final[Entries] = {
+    "tx": (0, "according to the true distances, none were programmed into the devices"),
+    "rx": (0, ""),
+}
+
+
+def _asked(entries: Entries) -> list[str]:
+    return [name for name, (value, _) in entries.items() if value == ASKED]
+
+
+def _constants(layout: str, columns: Mapping[str, str]) -> Entries:
+    """Return the ids without a column, which the user must give."""
+    why = "no column was recognised as {}: write a number or a word for all rows, or the column above"
+    ids = ALL_IDS if layout == "differences" else IDS
+    return {name: (ASKED, why.format(meaning)) for name, meaning in ids.items() if name not in columns}
+
+
+def _named(
+    layout: str, used: Mapping[str, str], given: Collection[str], words: Collection[str], names: Sequence[str]
+) -> Entries:
+    """Return the `used` columns that need a name, "?" where the user must choose; `words` have no numbers."""
+    named: Entries = {name: (header, "") for name, header in used.items() if name not in given}
+    if layout == "nothing" and not {*STAMPS} & used.keys():
+        named["range_m"] = (ASKED, "write the column of the ranges; or delete this line, and name those of stamps")
+    elif layout == "ranges" and "range_m" in named and (kinds := _kinds_of_range(used["range_m"], names)):
+        named["range_m"] = (ASKED, f"write the column that the device measured: {' or '.join(map(json.dumps, kinds))}")
+    if "gt_range_m" in words and "gt_range_m" in named:
+        missing = f"{json.dumps(used['gt_range_m'])} has no numbers: name a column, or delete the line"
+        named["gt_range_m"] = (ASKED, missing)
+    return named
 
 
 def _text(path: Path, sections: Mapping[str, Entries], remarks: Iterable[str]) -> str:

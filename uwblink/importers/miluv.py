@@ -20,7 +20,7 @@ import yaml
 from uwblink.arrays import Columns, Floats, in_time_order
 from uwblink.errors import ImportTableError, raising
 from uwblink.importers.plausibility import clocks, to_ticks
-from uwblink.importers.poses import in_order
+from uwblink.importers.poses import with_anchors
 from uwblink.importers.tables import SourceTable, connected, number, time_ns, whole_number
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
@@ -72,7 +72,8 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
     exchanges, measured_m = _read_exchanges(flight)
     poses, tags = _read_poses(flight), _read_tags(flight)
     constellation, off_m, places = _find_anchors(flight, exchanges, measured_m, poses, tags, wanted)
-    poses, tags = _with_anchors(poses, tags, places)
+    poses, anchors = with_anchors([poses], places)
+    tags += anchors
     # The distances measured by the authors are used only if the position of a tag is not known.
     known_m = distances_m(poses, tags, exchanges.initiator, exchanges.target, exchanges.time_ns)
     truth_m = np.where(np.isfinite(known_m), np.nan, measured_m)
@@ -252,8 +253,9 @@ def _find_anchors(
         return None, float("nan"), {}
     found = []
     for name, all_places in known.items():
-        places = {number: place for number, place in all_places.items() if number in ranging}
-        true_m = distances_m(*_with_anchors(poses, tags, places), *ends, exchanges.time_ns)
+        places = {number: place for number, place in sorted(all_places.items()) if number in ranging}
+        joined, anchors = with_anchors([poses], places)
+        true_m = distances_m(joined, [*tags, *anchors], *ends, exchanges.time_ns)
         off = np.abs(true_m - measured_m)[np.isin(ends[0], list(places)) | np.isin(ends[1], list(places))]
         off = off[np.isfinite(off)]
         found.append((float(np.median(off)) if len(off) else float("nan"), name, places))
@@ -265,15 +267,6 @@ def _find_anchors(
         )
     off_m, name, places = min(chosen)
     return name, off_m, places
-
-
-def _with_anchors(
-    poses: Poses, tags: list[Tag], places: dict[int, tuple[float, float, float]]
-) -> tuple[Poses, list[Tag]]:
-    """Return poses and tags with anchors added, each on a body of its own with a single pose."""
-    anchors = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in sorted(places)]
-    standing = [Poses.from_arrays([0], tag.body, [places[tag.tag]]) for tag in anchors]
-    return in_order([poses, *standing]), [*tags, *anchors]
 
 
 def _vectors(table: Any) -> Vectors:

@@ -209,8 +209,7 @@ def add_poses(
     parts, unturned = [part for part, _ in read], {name for part, turned in read if not turned for name in part.body}
     what = ", ".join(str(path) for path in files.values()) or str(tags_from)
     given, anchors = load_places(tags_from) if tags_from else ((), {})
-    fixed = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in anchors]
-    poses = in_order([*parts, *(Poses.from_arrays([0], f"anchor{n}", [place]) for n, place in anchors.items())])
+    poses, fixed = with_anchors(parts, anchors)
     with Recording.open(recording, update=True) as opened:
         if not force and (there := opened.count("poses")):
             raise RecordingExistsError(f"{recording}: holds {there} poses already; `force` replaces them")
@@ -281,13 +280,18 @@ def _check_units(what: str, exchanges: Exchanges, poses: Poses, tags: Sequence[T
         raise ImportTableError(f"{what}: {found}, not metres, by comparison of ranges and distances; convert them")
 
 
-def in_order(parts: list[Poses]) -> Poses:
-    """Join poses in order of time; single poses of standing bodies get the first time of the others."""
-    if len(parts) == 1:
-        return parts[0]
-    first = min((int(part.time_ns.min()) for part in parts if len(part) > 1), default=0)
-    moved = [part if len(part) > 1 else replace(part, time_ns=np.full(len(part), first)) for part in parts]
-    return Poses.concatenate(moved).in_time_order()
+def with_anchors(parts: Sequence[Poses], places: Mapping[int, tuple[float, float, float]]) -> tuple[Poses, list[Tag]]:
+    """Return poses in order of time with those of anchors, and the anchors as tags on bodies of their own.
+
+    Single poses of standing bodies get the first time of the others.
+    """
+    anchors = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in places]
+    joined = [*parts, *(Poses.from_arrays([0], one.body, [places[one.tag]]) for one in anchors)]
+    if len(joined) == 1:
+        return joined[0], anchors
+    first = min((int(part.time_ns.min()) for part in joined if len(part) > 1), default=0)
+    moved = [part if len(part) > 1 else replace(part, time_ns=np.full(len(part), first)) for part in joined]
+    return Poses.concatenate(moved).in_time_order(), anchors
 
 
 def _offset_ns(text: str) -> int:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Columns
 from uwblink.database import log_of
-from uwblink.display import printable
+from uwblink.display import first_few, printable
 from uwblink.errors import RecordingError, RecordingInUseError, RecordingMissingError, raising
 from uwblink.output import check_output, place_beside
 from uwblink.protocols.table import PROTOCOLS
@@ -341,7 +341,12 @@ class Recording(Store):
             if not np.ma.is_masked(codes):
                 found = {name: _filled(TABLES["exchanges"][name], column) for name, column in columns.items()}
                 return Exchanges(protocol=np.array(known)[np.asarray(codes) - 1], bits=int(bits), **found)
-        raise RecordingError(f"{self.path}: exchanges of an unknown protocol; known are {', '.join(known)}")
+        strange = [repr(printable(name)[:40]) for (name,) in self.tally("exchanges", "protocol") if name not in known]
+        raise RecordingError(
+            f"{self.path}: exchanges of an unknown protocol, {first_few(strange or ['NULL'])}; registered are "
+            f"{', '.join(known)}; install the distribution that adds it (entry point group uwbcal.protocols), or call "
+            "uwblink.register_protocol"
+        )
 
     def dividing_times(self, table: str, rows: int) -> list[int]:
         """Return times that divide one of `TABLES` into parts of about `rows` rows, with the first and the last time.

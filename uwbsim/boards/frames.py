@@ -22,12 +22,11 @@ from uwbsim.scenario.ranging import (
     FINAL_BYTES,
     POLL_BYTES,
     PREAMBLE_SYMBOL_S,
-    PREAMBLE_TIMEOUT_S,
     RESPONSE_BYTES,
     after_marker_s,
     before_marker_s,
 )
-from uwbsim.simulation.timestamps import draw_reply_s, next_grid, reply_counter, scheduled_counter
+from uwbsim.simulation.timestamps import next_grid, reply_counter, scheduled_counter
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.reception import Frames, Medium
@@ -129,7 +128,7 @@ class BoardAir:
 
     def reply_stamp(self, board: int, received: int) -> int:
         """Return the transmit stamp of an immediate reply to a frame received at a stamp, with a random latency."""
-        counter = reply_counter(received, draw_reply_s(self.scenario, self._rng, 1))
+        counter = reply_counter(received, self.scenario.ranging.reply.draw_s(self._rng, 1))
         return int(counter[0]) + self._tx_register(board)
 
     def scheduled_stamps(self, board: int, reference: int, delay_uus: int) -> tuple[int, int]:
@@ -238,9 +237,10 @@ class BoardRadio:
         """Whether a frame is being sent or scheduled."""
         return self._pending is not None and self._pending.end > self._air.env.now and not self._pending.cancelled
 
-    def listen(self) -> None:
-        """Switch the receiver on, at once or at the end of the frame that is being sent."""
+    def listen(self) -> int:
+        """Switch the receiver on, at once or at the end of the frame that is being sent; return that time (ns)."""
         self.since = self._pending.end if self._pending is not None and self.sending else int(self._air.env.now)
+        return self.since
 
     def off(self) -> None:
         """Switch receiver and transmitter off; a scheduled frame is never sent."""
@@ -255,15 +255,13 @@ class BoardRadio:
         self.listen()
         return self._pending
 
-    def wait(self, timeout: int | None = round(PREAMBLE_TIMEOUT_S * NS_PER_S)) -> Wait:
+    def wait(self, timeout: int | None) -> Wait:
         """Wait for a frame and return it; None if it is damaged, or if no preamble is detected within the timeout.
 
         Without a timeout the wait has no end.
         """
         env = self._air.env
-        if self.since is None:
-            self.listen()
-        since = int(env.now) if self.since is None else self.since
+        since = self.listen() if self.since is None else self.since
         arrived = self._waiting = env.event()
         if timeout is None:
             yield arrived

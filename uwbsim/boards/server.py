@@ -20,7 +20,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from uwblink.boards.ports import Terminal
+from uwblink.boards.ports import open_terminals
 from uwblink.output import new_file
 from uwblink.recording.schema import Poses
 from uwblink.text_files import read_text
@@ -222,23 +222,20 @@ class Server:
         )
         self._poses: LivePoses | None = None
         self._rng = stream(scenario.run.seed, "serial faults")
-        self._terminals: dict[int, Terminal] = {}
         self._selector = selectors.SelectSelector()
         self._start_ns = time.monotonic_ns()
         self.epoch_ns = time.time_ns()
         """Host time (Unix epoch) at which the scenario's time is zero."""
         self._reached_ns = 0
         self._timed = sched.scheduler(lambda: self._reached_ns)
-        try:
-            for tag in scenario.tags:
-                self._terminals[tag.id] = Terminal(link_dir / f"tag{tag.id}" if link_dir else None)
-                self._watch(tag.id)
-        except Exception:
-            self.close()
-            raise
-        self.names = {tag: terminal.name for tag, terminal in self._terminals.items()}
         for fault in self._faults.faults:
             self._arrange(fault)
+        self._terminals = open_terminals(
+            {tag.id: link_dir / f"tag{tag.id}" if link_dir else None for tag in scenario.tags}
+        )
+        for number in self._terminals:
+            self._watch(number)
+        self.names = {tag: terminal.name for tag, terminal in self._terminals.items()}
 
     @staticmethod
     def extended(scenario: Scenario, duration_s: float | None) -> Scenario:
@@ -248,11 +245,6 @@ class Server:
         """
         longer = min(max(scenario.run.duration_s, duration_s or 7200.0), LONGEST_RUN_S)
         return scenario.model_copy(update={"run": scenario.run.model_copy(update={"duration_s": longer})})
-
-    @property
-    def lost_bytes(self) -> int:
-        """Bytes that no client has read."""
-        return sum(t.lost_bytes for t in self._terminals.values())
 
     def run(self, stop: Callable[[], bool], duration_s: float = float("inf")) -> None:
         """Serve until `stop` returns True or the duration is over."""

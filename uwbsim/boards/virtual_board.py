@@ -51,8 +51,8 @@ FULL: Final = b"USB Buffer full! Message rejected to prevent overflow."
 class UsbLink:
     """The USB interface of one board from power-up to power-off.
 
-    `packets` wait to be read, and `arrived` is triggered when one comes; `lost` counts transfers that were dropped
-    because the bus was busy. Where it is not `open`, the board is unplugged, and transfers under way are lost.
+    `packets` wait to be read, and `arrived` is triggered when one comes. Transfers are lost while the bus is busy.
+    Where it is not `open`, the board is unplugged, and transfers under way are lost.
     """
 
     def __init__(self, env: simpy.Environment, send: Callable[[bytes], None]) -> None:
@@ -62,7 +62,6 @@ class UsbLink:
         self._busy_until = 0
         self.open = True
         self.arrived = env.event()
-        self.lost = 0
 
     def write(self, data: bytes) -> None:
         """Receive one write of the host, in packets of 64 bytes."""
@@ -99,10 +98,7 @@ class UsbLink:
 
     def _transfer(self, data: bytes) -> None:
         now = int(self._env.now)
-        if not self.open:
-            return
-        if now < self._busy_until:
-            self.lost += 1
+        if not self.open or now < self._busy_until:
             return
         self._busy_until = now + -(-len(data) // PACKET_BYTES) * PACKET_GAP
         self._send(data)
@@ -159,7 +155,7 @@ class Bench:
 class VirtualBoard:
     """One board. `write` takes bytes from the host; the bench's `send` is called with the board's output.
 
-    C04 sets `passive` and C08 `delay_uus`; unplugging clears `powered`, and a hard fault `alive`.
+    C04 sets `passive` and C08 `delay_uus`; unplugging closes `usb`, and a hard fault clears `alive`.
     """
 
     def __init__(self, bench: Bench, board: int) -> None:
@@ -171,7 +167,7 @@ class VirtualBoard:
 
     def _power_on(self) -> None:
         env = self.bench.env
-        self.powered, self.alive = True, True
+        self.alive = True
         self.passive = False
         self.delay_uus = 1500  # UWB microseconds, until C08 sets it
         self.ranging = False
@@ -191,7 +187,6 @@ class VirtualBoard:
 
     def power_off(self) -> None:
         """Switch the power off: the board neither sends nor receives."""
-        self.powered = False
         self.usb.open = False
         self.hang()
 
@@ -205,8 +200,7 @@ class VirtualBoard:
 
     def write(self, data: bytes) -> None:
         """Receive one write of the host."""
-        if self.powered:
-            self.usb.write(data)
+        self.usb.write(data)
 
     def send(self, what: bytes | Message, delay: int = 0) -> None:
         """Print something after a delay (ns)."""
@@ -354,7 +348,7 @@ class VirtualPorts:
     def open(self, name: str) -> VirtualPort:
         """Return the port with one of `names`, empty; raises `PortMissingError` for another or an unplugged one."""
         tag = next((tag for tag, known in self.names.items() if known == name), None)
-        if tag is None or not self.bench.boards[tag].powered:
+        if tag is None or not self.bench.boards[tag].usb.open:
             raise PortMissingError(f"{name}: no such port; there are {', '.join(self.names.values())}")
         port = self.port(tag)
         port.waiting.clear()
@@ -364,7 +358,7 @@ class VirtualPorts:
         """Advance time until bytes wait at one of some ports, or to the timeout; return the ports to read from."""
 
         def ready() -> list[VirtualPort]:
-            return [p for p in ports if p.waiting or not self.bench.boards[p.tag].powered]
+            return [p for p in ports if p.waiting or not self.bench.boards[p.tag].usb.open]
 
         self.bench.advance_until(ready, timeout_s)
         return ready()
@@ -383,7 +377,7 @@ class VirtualPorts:
 
     def moved(self, name: str, number: str | None) -> str | None:
         """Return the name of a port that is plugged in, None for another one."""
-        return name if any(known == name and self.bench.boards[t].powered for t, known in self.names.items()) else None
+        return name if any(known == name and self.bench.boards[t].usb.open for t, known in self.names.items()) else None
 
     def _arrived(self, time_ns: int, tag: int, data: bytes) -> None:
         self.transfers.append((time_ns, tag, data))
@@ -422,5 +416,5 @@ class VirtualPort:
         self.waiting.clear()
 
     def _check(self) -> None:
-        if not self._ports.bench.boards[self.tag].powered:
+        if not self._ports.bench.boards[self.tag].usb.open:
             raise PortLostError(f"{self.name}: the port is gone (unplugged); plug the board in again")

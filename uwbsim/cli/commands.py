@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -26,7 +27,6 @@ from uwblink.cli.shared import (
     Seed,
     Seeds,
     add,
-    choice,
     interrupts,
     new_app,
     print_json,
@@ -35,7 +35,8 @@ from uwblink.cli.shared import (
     starting,
     waiting,
 )
-from uwblink.output import check_folder, check_output
+from uwblink.output import check_apart, check_folder, check_output
+from uwbsim.settings import protocol_names
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -60,14 +61,8 @@ AllowFiles = Annotated[
 ]
 
 
-def _protocols() -> list[str]:
-    from uwblink import PROTOCOLS
-
-    return list(PROTOCOLS)
-
-
 Protocols = Annotated[
-    str, typer.Option(help="Protocols, separated by commas, or all.", **several(lambda: ["all", *_protocols()]))
+    str, typer.Option(help="Protocols, separated by commas, or all.", **several(lambda: ["all", *protocol_names()]))
 ]
 
 
@@ -89,7 +84,7 @@ def run(
 ) -> None:
     """Simulate a scenario and write the recording of its boards and motion capture."""
     check_output(output, force=force, recording=True)
-    loaded = _programmed(uwbsim.load(scenario, overrides or (), seed, allow_files=allow_files or ()), antenna_delays)
+    loaded = _loaded(scenario, overrides, allow_files, antenna_delays, seed)
     with waiting(loaded.run.name) as report:
         simulated = uwbsim.simulate(loaded, report, contention=contention)
     frames: list[Any] = []
@@ -103,11 +98,18 @@ def run(
     )
 
 
-def _programmed(scenario: uwbsim.Scenario, path: Path | None) -> uwbsim.Scenario:
-    """Return a scenario with the antenna delays of a file programmed into its tags."""
-    if path is None:
-        return scenario
-    return scenario.model_copy(update={"tags": uwbsim.scenario.with_antenna_delays(scenario.tags, path)})
+def _loaded(
+    scenario: Path,
+    overrides: list[str] | None,
+    allow_files: list[Path] | None,
+    antenna_delays: Path | None = None,
+    seed: int | None = None,
+) -> uwbsim.Scenario:
+    """Return a scenario with the antenna delays of a file, if there is one, programmed into its tags."""
+    loaded = uwbsim.load(scenario, overrides or (), seed, allow_files=allow_files or ())
+    if antenna_delays is None:
+        return loaded
+    return loaded.model_copy(update={"tags": uwbsim.scenario.with_antenna_delays(loaded.tags, antenna_delays)})
 
 
 def scenarios(
@@ -148,12 +150,11 @@ def serve(
     """Run the boards of a scenario on pseudo-terminals, where they answer like real boards on serial ports."""
     if poses:
         check_output(poses, force=force)
-    loaded = _programmed(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()), antenna_delays)
+        check_apart({"poses": poses}, filter(None, (scenario, faults, antenna_delays)))
+    loaded = _loaded(scenario, overrides, allow_files, antenna_delays)
     wrong = uwbsim.load_faults(faults, [tag.id for tag in loaded.tags]) if faults else None
-    server = uwbsim.Server(
-        uwbsim.Server.extended(loaded, duration), link_dir, wrong, tell=lambda text: typer.echo(text, err=True)
-    )
-    try:
+    served = uwbsim.Server.extended(loaded, duration)
+    with closing(uwbsim.Server(served, link_dir, wrong, tell=lambda text: typer.echo(text, err=True))) as server:
         for tag, name in server.names.items():
             typer.echo(f"tag {tag:3d}  {name}")
         ports = f"{link_dir}/*" if link_dir else " ".join(server.names.values())
@@ -164,8 +165,6 @@ def serve(
             server.write_poses(poses)
         with interrupts() as stop:
             server.run(stop, duration or float("inf"))
-    finally:
-        server.close()
 
 
 def show(
@@ -178,7 +177,7 @@ def show(
     """Draw the room, the flights, and one exchange of each protocol."""
     check_output(output, force=force)
     with waiting("drawing"):
-        uwbsim.show(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()), output, force=force)
+        uwbsim.show(_loaded(scenario, overrides, allow_files), output, force=force)
     typer.echo(f"{output}")
 
 
@@ -189,7 +188,7 @@ def validate(
     as_json: AsJson = False,
 ) -> None:
     """Summarise what a scenario will do, without running it."""
-    found = uwbsim.preview(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()))
+    found = uwbsim.preview(_loaded(scenario, overrides, allow_files))
     print_result(found.to_dict(), str(found), as_json=as_json)
 
 
@@ -211,7 +210,7 @@ def compare(
 ) -> None:
     """Simulate ranges of every protocol in the same random world, and compare their errors and costs."""
     rows = _rows(protocols)
-    loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
+    loaded = _loaded(scenario, overrides, allow_files)
     check_folder(output, uwbsim.pages.FILES, force=force)
     _check_figures(figures, force=force)
     with waiting(loaded.run.name) as report:
@@ -257,51 +256,7 @@ def _print_table(rows: Sequence[Sequence[str]], title: str | None = None) -> Non
 
 
 def predict(
-    protocol: Annotated[
-        str,
-        typer.Option(help="Protocol by its name.", **choice("ss", "ss-cfo", "ds", "ds-alt", "ds-sym", more=_protocols)),
-    ] = "ds",
-    skew_ppm: Annotated[
-        float, typer.Option(rich_help_panel="Tags", help="Skew of the initiator's clock relative to the target's.")
-    ] = 0.0,
-    reply_delay_us: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel="Timing", help="Delay of the target's reply (dt32).")
-    ] = 300.0,
-    final_delay_us: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            rich_help_panel="Timing",
-            help="Delay of the third message (dt53; only ds, ds-alt); by default 1538.7.",
-        ),
-    ] = None,
-    distance_m: Annotated[float, typer.Option(min=0.0, rich_help_panel="Tags", help="Distance.")] = 5.0,
-    speed_mps: Annotated[float, typer.Option(rich_help_panel="Tags", help="Speed at which the distance grows.")] = 0.0,
-    drift_ppm_per_s: Annotated[float, typer.Option(rich_help_panel="Tags", help="Change of the relative skew.")] = 0.0,
-    tx_noise_ps: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel="Noise", help="Standard deviation of transmit stamps.")
-    ] = 0.0,
-    rx_noise_ps: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel="Noise", help="Standard deviation of receive stamps.")
-    ] = 150.0,
-    carrier_noise_ppm: Annotated[
-        float,
-        typer.Option(min=0.0, rich_help_panel="Noise", help="Standard deviation of the carrier integrator's reading."),
-    ] = 0.2,
-    carrier_bias_ppm: Annotated[
-        float, typer.Option(rich_help_panel="Noise", help="Bias of the carrier integrator's reading.")
-    ] = 0.0,
-    delay_initiator_ns: Annotated[
-        float,
-        typer.Option(rich_help_panel="Tags", help="Antenna delay of the initiator; a positive one shortens ranges."),
-    ] = 0.0,
-    delay_target_ns: Annotated[
-        float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the target; a positive one shortens ranges.")
-    ] = 0.0,
-    whole_ticks: Annotated[
-        bool,
-        typer.Option("--whole-ticks", rich_help_panel="Noise", help="Round stamps to ticks of 15.65 ps."),
-    ] = False,
+    state: uwbsim.State,
     tags: Annotated[
         int | None,
         typer.Option(help="Also predict the rates and errors of a fleet of this many tags, for each way of ranging."),
@@ -309,22 +264,6 @@ def predict(
     as_json: AsJson = False,
 ) -> None:
     """Predict the bias and standard deviation of a range analytically."""
-    state = uwbsim.State(
-        protocol=protocol,
-        skew_ppm=skew_ppm,
-        reply_delay_us=reply_delay_us,
-        final_delay_us=final_delay_us,
-        distance_m=distance_m,
-        speed_mps=speed_mps,
-        drift_ppm_per_s=drift_ppm_per_s,
-        tx_noise_ps=tx_noise_ps,
-        rx_noise_ps=rx_noise_ps,
-        carrier_noise_ppm=carrier_noise_ppm,
-        carrier_bias_ppm=carrier_bias_ppm,
-        delay_initiator_ns=delay_initiator_ns,
-        delay_target_ns=delay_target_ns,
-        whole_ticks=whole_ticks,
-    )
     found, fleet = uwbsim.predict_state(state), [] if tags is None else uwbsim.predict_fleet(state, tags)
     more = {"fleet": [one.to_dict() for one in fleet]} if fleet else {}
     print_result(found.to_dict() | more, str(found), as_json=as_json)
@@ -344,7 +283,7 @@ def optimum(
 ) -> None:
     """Find the delay of the scheduled message that minimises the error of a pair's ranges averaged over one second."""
     rows = _rows(protocols)
-    loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
+    loaded = _loaded(scenario, overrides, allow_files)
     if output:
         check_folder(output, [uwbsim.pages.optimum_file(row.name) for row in rows], force=force)
     with waiting("searching"):

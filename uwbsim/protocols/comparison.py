@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -90,16 +90,12 @@ class ProtocolComparison:
         Errors are those after a calibration. `rmse` compares single ranges; `per_second` compares the mean of all
         ranges of a pair in a second (`PredictedErrors.mean_of`), which matters if ranges are averaged.
         """
-        world = calibrated(conditions_of(self.scenario, 2048))
-        rows = []
+        world, rows = calibrated(conditions_of(self.scenario, 2048)), []
         for delay_us in (300, 600, 1000, 1500, 2000, 3000, 5000):
-            here = world.with_columns(scheduled=delay_us * 1e-6)
             rmse, score = {}, {}
             for protocol in self.protocols:
-                found = predict(protocol, here)
-                duration = costs(self.scenario, protocol, delay_us * 1e-6)["duration_s"] + TURNAROUND_S
-                rmse[protocol.name] = float(np.sqrt(found.mean_of(1)))
-                score[protocol.name] = found.mean_of(1 / duration)
+                _, one_m2, score[protocol.name] = _at_delay(self.scenario, protocol, world, delay_us * 1e-6)
+                rmse[protocol.name] = math.sqrt(one_m2)
             rows.append(
                 {
                     "scheduled_us": delay_us,
@@ -192,9 +188,7 @@ def _outcome(scenario: Scenario, protocol: RangingProtocol, conditions: Conditio
         predicted_bias_m=bias,
         predicted_std_m=float(np.sqrt(variance)),
         messages=len(protocol.messages),
-        air_s=cost["air_s"],
-        duration_s=cost["duration_s"],
-        radio_on_s=cost["radio_on_s"],
+        **cost,
         rate_hz=1 / (cost["duration_s"] + TURNAROUND_S),
     )
 
@@ -208,6 +202,18 @@ def costs(scenario: Scenario, protocol: RangingProtocol, scheduled_s: float | No
     return exchange_costs(
         protocol, scenario.radio.preamble_symbols, scheduled_s or ranging.scheduled_s, ranging.at_once_s
     )
+
+
+def _at_delay(
+    scenario: Scenario, protocol: RangingProtocol, world: Conditions, delay_s: float, overhead_s: float = 0.0
+) -> tuple[float, float, float]:
+    """Return the duration of an exchange whose scheduled message has this delay, turnaround included, and its errors.
+
+    These are the mean squared error of one range, and of the mean of a second of them.
+    """
+    duration = costs(scenario, protocol, delay_s)["duration_s"] + TURNAROUND_S + overhead_s
+    found = predict(protocol, world.with_columns(scheduled=delay_s))
+    return duration, found.mean_of(1), found.mean_of(1 / duration)
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,25 +331,18 @@ def optimum(scenario: Scenario | Source, protocol: str | RangingProtocol = "ds",
     # From 280 UWB microseconds on, below which boards miss the time to send (firmware wire format), to their longest.
     delays = np.geomspace(287e-6, 6.6e-3, 121)
 
-    def duration(delay: float) -> float:
-        return costs(scenario, protocol, delay)["duration_s"] + TURNAROUND_S + overhead_s
-
-    def errors(delay: float) -> tuple[float, float]:
-        """Return the mean squared error of one range, and of the mean of a second of them."""
-        found = predict(protocol, world.with_columns(scheduled=delay))
-        return found.mean_of(1), found.mean_of(1 / duration(delay))
-
-    one, second = np.array([errors(float(delay)) for delay in delays]).T
+    tried = partial(_at_delay, scenario, protocol, world, overhead_s=overhead_s)
+    _, one, second = np.array([tried(float(delay)) for delay in delays]).T
     best = int(np.argmin(second))
     low, high = delays[max(best - 1, 0)], delays[min(best + 1, len(delays) - 1)]
-    refined = minimize_scalar(lambda d: errors(d)[1], bounds=(low, high), method="bounded", options={"xatol": 1e-8})
-    delay = min((float(refined.x), float(delays[best])), key=lambda d: errors(d)[1])
-    one_m2, second_m2 = errors(delay)
+    refined = minimize_scalar(lambda d: tried(d)[2], bounds=(low, high), method="bounded", options={"xatol": 1e-8})
+    delay = min((float(refined.x), float(delays[best])), key=lambda d: tried(d)[2])
+    duration_s, one_m2, second_m2 = tried(delay)
     return BestDelay(
         protocol=protocol.name,
         delay_s=delay,
         rms_m=math.sqrt(one_m2),
-        duration_s=duration(delay),
+        duration_s=duration_s,
         second_rms_m=math.sqrt(second_m2),
         on_edge=best in (0, len(delays) - 1),
         delays_s=delays,

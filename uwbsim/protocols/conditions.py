@@ -23,7 +23,6 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.ranging import before_marker_s
 from uwbsim.simulation.air import schedule
-from uwbsim.simulation.timestamps import draw_reply_s
 from uwbsim.world.clocks import RATE_SPAN_S, SUBTICKS_PER_SECOND, WALK_STEP_S, Clocks
 from uwbsim.world.radio import carrier_bias_ppm
 from uwbsim.world.reception import AntennaDelays, stamp_errors_s
@@ -193,7 +192,7 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
         tx_std=np.full(len(rows), (radio.tx_noise_ps * 1e-12)),
         tx_delay=np.array([delays.transmit_s(end, start) for end in (i, j)]),
         rx_delay=np.array([delays.receive_s(end, start) for end in (i, j)]),
-        at_once=draw_reply_s(scenario, stream(scenario.run.seed, "reply latency"), len(rows)),
+        at_once=scenario.ranging.reply.draw_s(stream(scenario.run.seed, "reply latency"), len(rows)),
         scheduled=np.full(len(rows), scenario.ranging.response_delay_uus * UUS_TICKS * TICK_S),
         power_dbm=link.power_dbm,
         carrier_bias_ppm=carrier_bias_ppm(radio, back.power_dbm),

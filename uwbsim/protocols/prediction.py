@@ -12,7 +12,6 @@ between them, from three frames of j (`uwblink.receptions`).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -25,6 +24,7 @@ from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S, TX_SHARE
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.conditions import SIDES, Conditions, Stamps, calibrated, chosen, exchange, intervals_of
 from uwbsim.scenario.ranging import TURNAROUND_S, broadcast_s, exchange_costs
+from uwbsim.settings import State
 from uwbsim.world.clocks import RATE_SPAN_S
 
 
@@ -108,49 +108,6 @@ def _white_clocks(protocol: RangingProtocol, slopes: dict[str, Floats], mean: St
     return total
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class State:
-    """One state of the world to predict ranges in; `protocol` is a name or a row of `PROTOCOLS`.
-
-    The skew is that of the initiator's clock relative to the target's, shared by both equally. `reply_delay_us` is the
-    target's reply (dt32), `final_delay_us` the third message's delay (dt53), None for that of the boards, 1538.7; a
-    protocol without a third message, or whose third message waits as long as the reply ("ds-sym"), takes none. An
-    aggregate antenna delay is split 0.44 to 0.56 between transmission and reception, which changes nothing.
-
-    >>> from uwbsim import State
-    >>> State(protocol="ss", skew_ppm=4.0).reply_delay_us
-    300.0
-    """
-
-    protocol: str | RangingProtocol = "ds"
-    skew_ppm: float = 0.0
-    reply_delay_us: float = 300.0
-    final_delay_us: float | None = None
-    distance_m: float = 5.0
-    speed_mps: float = 0.0
-    drift_ppm_per_s: float = 0.0
-    tx_noise_ps: float = 0.0
-    rx_noise_ps: float = 150.0
-    carrier_noise_ppm: float = 0.2
-    carrier_bias_ppm: float = 0.0
-    delay_initiator_ns: float = 0.0
-    delay_target_ns: float = 0.0
-    whole_ticks: bool = False
-
-
-def _check(q: State) -> None:
-    """Raise `ParameterError` for a value of a state that is out of range."""
-    lows = dict.fromkeys(("reply_delay_us", "distance_m", "tx_noise_ps", "rx_noise_ps", "carrier_noise_ppm"), 0.0)
-    lows["final_delay_us"] = 1.0  # a third message that follows at once would not tell the clocks' rates
-    for name, value in asdict(q).items():
-        if name in ("protocol", "whole_ticks") or value is None:
-            continue
-        if not isinstance(value, int | float) or not abs(value) < 1e9:
-            raise ParameterError(f"found {value}, expected a number below 1e+09", parameter=name)
-        if value < (least := lows.get(name, -math.inf)):
-            raise ParameterError(f"found {value:g}, expected {least:g} or more", parameter=name)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Prediction:
     """The predicted error of a raw range in one state: `bias_m`, `std_m`, `variance_m2`, and in ps of time of flight.
@@ -195,7 +152,7 @@ class Prediction:
 def predict_state(q: State) -> Prediction:
     """Predict bias and standard deviation of a raw range analytically, and the parts of the latter.
 
-    Raises `ParameterError` for a number out of range, and for an unknown protocol.
+    Raises `ParameterError` for an unknown protocol.
 
     >>> import uwbsim
     >>> found = uwbsim.predict_state(uwbsim.State(protocol="ss", skew_ppm=2.0, reply_delay_us=1000.0, rx_noise_ps=0.0))
@@ -221,7 +178,6 @@ def predict_state(q: State) -> Prediction:
 
 def conditions_of_state(q: State, protocol: RangingProtocol) -> Conditions:
     """Return a state as conditions (1,) of exchanges of a protocol; raises what `predict_state` raises."""
-    _check(q)
     # The target's reply is the scheduled message where there is no third one, or where both replies are equal.
     timings = [message.timing for message in protocol.messages]
     target_waits, final_at_once = timings[1] == "scheduled", timings[1:] == ["scheduled", "at once"]

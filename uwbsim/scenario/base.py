@@ -64,15 +64,17 @@ def check_limits(key: str, value: Any) -> None:
 
 
 def _increasing(values: Sequence[float]) -> Sequence[float]:
-    rising = all(a < b for a, b in pairwise(values))
-    require(rising, "found a value that is not above the one before; they must increase")
+    require(
+        all(a < b for a, b in pairwise(values)), "found a value that is not above the one before; they must increase"
+    )
     return values
 
 
 def not_decreasing(values: Sequence[float]) -> Sequence[float]:
     """Raise `ValueError` for values that do not increase or stay."""
-    rising = all(a <= b for a, b in pairwise(values))
-    require(rising, "found a value that is below the one before; they must not decrease")
+    require(
+        all(a <= b for a, b in pairwise(values)), "found a value that is below the one before; they must not decrease"
+    )
     return values
 
 

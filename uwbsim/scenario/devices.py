@@ -6,8 +6,10 @@ import itertools
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from uwblink.arrays import Floats
 from uwblink.errors import PlanError, restating
 from uwblink.recording.antenna_delays import REGISTER_MAX, delay_of, load_antenna_delays
 from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S, TX_SHARE
@@ -22,6 +24,10 @@ class Constant(Section):
     model: Literal["constant"] = Field("constant", description="The same all the time.")
     value: float = Field(description="Its value.")
 
+    def at(self, time_s: Floats) -> Floats:
+        """Return the value at times (n,)."""
+        return np.full(time_s.shape, self.value)
+
 
 class Ramp(Section):
     """From one value to another, evenly, over `duration_s` from `begin_s` on; constant before and after."""
@@ -31,6 +37,12 @@ class Ramp(Section):
     end: float = Field(description="The value after.")
     duration_s: Positive = Field(description="How long it takes.")
     begin_s: float = Field(0.0, description="When it begins.")
+
+    def at(self, time_s: Floats) -> Floats:
+        """Return the values at times (n,)."""
+        return np.asarray(
+            self.start + (self.end - self.start) * np.clip((time_s - self.begin_s) / self.duration_s, 0, 1)
+        )
 
 
 class WarmUp(Section):
@@ -44,6 +56,11 @@ class WarmUp(Section):
     end: float = Field(description="The value in the limit.")
     time_constant_s: Positive = Field(description="Time in which the difference decreases by the factor e.")
     begin_s: float = Field(0.0, description="When it begins; negative: part of it is over when the run begins.")
+
+    def at(self, time_s: Floats) -> Floats:
+        """Return the values at times (n,)."""
+        left = np.exp(-np.maximum(time_s - self.begin_s, 0) / self.time_constant_s)
+        return np.asarray(self.end + (self.start - self.end) * left)
 
 
 class ProfileTable(Section):
@@ -66,6 +83,10 @@ class ProfileTable(Section):
         matched = self.times_s and len(self.times_s) == len(self.values)
         require(matched, f"values: found {len(self.values)} at {len(self.times_s)} times, give one a time")
         return self
+
+    def at(self, time_s: Floats) -> Floats:
+        """Return the values at times (n,)."""
+        return np.asarray(np.interp(time_s, self.times_s, self.values))
 
 
 def _constant(value: Any) -> Any:

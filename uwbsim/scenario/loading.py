@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from uwblink.errors import UwblinkError, restating
+from uwblink.errors import UwblinkError, raising, restating
 from uwblink.output import made_folder, whole
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import SUFFIX
@@ -305,10 +305,10 @@ def fill_in(table: dict[str, Any], scenario: Path, folders: Folders = ()) -> Non
                 section[key] = ({} if key == "antenna" else named) | read(path, key, named)
 
 
-def check_linked(path: Path, where: str, beside: Path, folders: Folders) -> Path:
-    """Return a file that another file names; raises `ScenarioError`, which begins with `where`.
+def check_linked(path: Path, where: str, beside: Path, folders: Folders) -> None:
+    """Check a file that another file names; raises `ScenarioError`, which begins with `where`.
 
-    It is a regular file of text in the folder `beside` or one of `folders`, or below, or a recording there.
+    It must be a regular file of text in the folder `beside` or one of `folders`, or below, or a recording there.
     """
     try:
         place = path.resolve()
@@ -329,21 +329,20 @@ def check_linked(path: Path, where: str, beside: Path, folders: Folders) -> Path
     most = 64_000_000
     if place.suffix != SUFFIX and (size := place.stat().st_size) > most:
         raise ScenarioError(f"{where}, which has {size} bytes; at most {most} are read")
-    return path
 
 
 def _rows(path: Path, *columns: str) -> list[list[float]]:
     """Return the rows of a CSV file, with these columns; lines that begin with # are comments."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(line for line in file if not line.startswith("#"))
-            missing = [c for c in columns if c not in (reader.fieldnames or [])]
-            if missing:
-                raise ScenarioError(f"{path}: column {missing[0]!r} is missing; expected {', '.join(columns)}")
-            some = islice(reader, MOST_ROWS + 1)
-            rows = [[_number(path, reader.line_num, c, row[c]) for c in columns] for row in some]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ScenarioError(f"{path}: cannot be read as a table ({error})") from error
+    with (
+        raising(ScenarioError, f"{path}: cannot be read as a table", OSError, UnicodeDecodeError, csv.Error),
+        path.open(encoding="utf-8-sig", newline="") as file,
+    ):
+        reader = csv.DictReader(line for line in file if not line.startswith("#"))
+        missing = [c for c in columns if c not in (reader.fieldnames or [])]
+        if missing:
+            raise ScenarioError(f"{path}: column {missing[0]!r} is missing; expected {', '.join(columns)}")
+        some = islice(reader, MOST_ROWS + 1)
+        rows = [[_number(path, reader.line_num, c, row[c]) for c in columns] for row in some]
     if not 0 < len(rows) <= MOST_ROWS:
         raise ScenarioError(f"{path}: found {'more' if rows else 'no'} rows, expected 1 to {MOST_ROWS}")
     return rows

@@ -163,6 +163,12 @@ class Fading(Section):
         require(not (self.levels_db and self.std_db), "levels_db: give either levels_db or std_db")
         return self
 
+    def draw_db(self, rng: np.random.Generator, count: int) -> Floats:
+        """Draw changes of power in dB, (1, count)."""
+        if not self.levels_db:
+            return self.std_db * rng.standard_normal((1, count))
+        return np.interp(rng.random((1, count)), np.linspace(0, 1, len(self.levels_db)), self.levels_db)
+
 
 class Outages(Section):
     """Intervals in which two tags do not hear each other, without another cause in the scenario: `share` of the time.
@@ -172,6 +178,10 @@ class Outages(Section):
 
     share: Share = Field(description="Share of time in which two tags do not hear each other.")
     life_s: Annotated[float, Field(ge=0.01)] = Field(0.5, description="Mean time between redraws.")
+
+    def draw_db(self, rng: np.random.Generator, count: int) -> Floats:
+        """Draw changes of power in dB, (1, count)."""
+        return np.where(rng.random((1, count)) < self.share, -80.0, 0.0)  # below any sensitivity
 
 
 class GeometricMultipath(Section):

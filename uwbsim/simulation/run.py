@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Floats
 from uwblink.protocols.table import ON_BOARDS, PROTOCOLS, RangingProtocol
 from uwblink.recording.contents import Contents
 from uwblink.recording.schema import FrameRow, Tag
@@ -28,10 +28,8 @@ from uwbsim.scenario.ranging import before_marker_s
 from uwbsim.simulation.air import WEAK, Air, Outcomes, Schedule, Slots, schedule, with_collisions_of_broadcasts
 from uwbsim.simulation.timestamps import (
     Draws,
-    Stamped,
     draw,
     one_departure,
-    overhear,
     provenance,
     reported_broadcasts,
     reported_exchanges,
@@ -154,23 +152,13 @@ def simulate(
     if broadcast:
         draws = one_departure(draws, len(scenario.tags) - 1)
     slots = _slots(medium, world, protocol, plan, draws)
-    if contention and not broadcast:
-        sampled = SampledWorld(world)
-        execution = Air(
-            protocol, slots, lambda tag, time: sampled.from_sender(tag, max(time, 0)).power_dbm, scenario.radio
-        )
-        outcomes = execution.execute(progress)
-    else:
-        outcomes = _undisturbed(scenario, slots)
-        if contention:
-            outcomes = with_collisions_of_broadcasts(medium, plan, outcomes)
+    outcomes = _executed(medium, world, protocol, slots, progress, contention=contention)
     begun, lost = np.array(outcomes.start, dtype=np.int64), np.array(outcomes.lost)
     kept = np.flatnonzero(lost < 0)
     kept = kept[np.argsort(begun[kept], kind="stable")]
     rows = replace(plan[kept], start=begun[kept])
     stamped = stamp(medium, protocol, rows, draws[kept])
-    reported = reported_broadcasts if broadcast else _reported
-    found = reported(medium, kept, len(plan.start), rows, stamped)
+    found = (reported_broadcasts if broadcast else reported_exchanges)(medium, stamped)
     return Simulated(
         **found,
         poses=world.motion_capture(),
@@ -182,13 +170,6 @@ def simulate(
         imu=sensor_readings(scenario, world.trajectories, "imu"),
         height=sensor_readings(scenario, world.trajectories, "height"),
     )
-
-
-def _reported(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped: Stamped) -> dict[str, Any]:
-    """Return what boards report of the `kept` exchanges (n,), of all `planned`, and their true distances."""
-    exchanges = reported_exchanges(medium, kept, planned, rows, stamped)
-    truth_m = (stamped.links[0].distance_m + stamped.links[1].distance_m) / 2
-    return {"exchanges": exchanges, "overheard": overhear(medium, stamped, exchanges), "truth_m": truth_m}
 
 
 def _slots(medium: Medium, world: World, protocol: RangingProtocol, plan: Schedule, draws: Draws) -> Slots:
@@ -220,12 +201,29 @@ def _slots(medium: Medium, world: World, protocol: RangingProtocol, plan: Schedu
     return Slots(plan, pause, medium.heard(np.array(powers), noise), delay)
 
 
-def _undisturbed(scenario: Scenario, slots: Slots) -> Outcomes:
-    """Return the outcomes of exchanges without contention: only messages below the sensitivity are lost."""
-    lost = np.where(slots.heard.all(axis=0), -1, np.argmin(slots.heard, axis=0))
-    marker = round(before_marker_s(scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
-    reasons = [WEAK if k >= 0 else "" for k in lost.tolist()]
-    return Outcomes((slots.plan.start + marker).tolist(), lost.tolist(), reasons)
+def _executed(
+    medium: Medium,
+    world: World,
+    protocol: RangingProtocol,
+    slots: Slots,
+    progress: Callable[[float], None] | None,
+    *,
+    contention: bool,
+) -> Outcomes:
+    """Return the outcomes of a plan by the event loop; without contention only messages that are too weak are lost.
+
+    Broadcasts need no event loop, because their slots depend on nothing that is received.
+    """
+    scenario = medium.scenario
+    broadcast, radio = scenario.ranging.plan == "broadcast", scenario.radio
+    if contention and not broadcast:
+        sampled = SampledWorld(world)
+        air = Air(protocol, slots, lambda tag, time: sampled.from_sender(tag, max(time, 0)).power_dbm, radio)
+        return air.execute(progress)
+    lost = np.where(slots.heard.all(axis=0), -1, np.argmin(slots.heard, axis=0)).tolist()
+    marker = round(before_marker_s(radio.preamble_symbols) * SUBTICKS_PER_SECOND)
+    alone = Outcomes((slots.plan.start + marker).tolist(), lost, [WEAK if k >= 0 else "" for k in lost])
+    return with_collisions_of_broadcasts(medium, slots.plan, alone) if contention else alone
 
 
 def through_wire(simulated: Simulated) -> tuple[Simulated, list[FrameRow]]:

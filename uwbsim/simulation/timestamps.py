@@ -6,13 +6,14 @@ are exchanges, failures, overheard exchanges, impulse responses, and the provena
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.arrays import Floats, Ints, in_time_order
+from uwblink.arrays import ArrayRows, Floats, Ints, in_time_order
 from uwblink.protocols.table import RangingProtocol
 from uwblink.receptions import Receptions, exchanges_in
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, meta_of_delays
@@ -29,7 +30,7 @@ from uwblink.twr import STAMPS, Exchanges, board_range, raw_range
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.air import WEAK, Outcomes, Schedule
-from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, Link
+from uwbsim.world.channel import CHANNEL_EFFECTS, Link
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import INDEX_STEPS, impulse_response
 from uwbsim.world.reception import Frames, Medium
@@ -41,80 +42,69 @@ MASK: Final = (1 << REPORT_BITS) - 1
 Ticks = TypeVar("Ticks", Ints, int)
 
 
-@dataclass(slots=True)
-class Draws:
+@dataclass(frozen=True, slots=True)
+class Draws(ArrayRows):
     """Random numbers of planned slots, one row per slot, so that a lost exchange shifts no others.
 
-    `transmit` and `receive` are standard normal, shape (messages, n); `reply_s` is the latency of a
-    reply sent at once; `excess_m` the detour by multipath.
+    `slot` are their numbers. Noise is standard normal: `transmit` and `receive` of stamps, (n, messages), `power` and
+    `skew` of the readings of the first two messages, (n, 2). `reply_s` is the latency of a reply sent at once,
+    `excess_m` the detour by multipath of all messages.
     """
+
+    slot: Ints
 
     transmit: Floats
     receive: Floats
+    power: Floats
+    skew: Floats
     reply_s: Floats
     excess_m: Floats
-
-    def __getitem__(self, rows: Ints) -> Draws:
-        """Return the draws of the chosen slots."""
-        return Draws(self.transmit[:, rows], self.receive[:, rows], self.reply_s[rows], self.excess_m[rows])
 
 
 @dataclass(slots=True)
 class Stamped:
     """Stamps in whole ticks, not wrapped, and frames and links of the messages, (n,) each; one list item per message.
 
-    `detour_m` (n,) is the random detour of all messages of an exchange.
+    `draws` are the random numbers that they were made with.
     """
 
     stamps: dict[str, Ints]
     frames: list[Frames]
     links: list[Link]
-    detour_m: Floats
+    draws: Draws
 
 
 def draw(scenario: Scenario, count: int, messages: int) -> Draws:
     """Draw for `count` planned slots from the scenario's named streams."""
     seed, numbers, excess = scenario.run.seed, range(messages), np.zeros(count)
+
+    def noise(purpose: str, numbers: Iterable[int]) -> Floats:
+        return np.column_stack([stream(seed, purpose, k).normal(size=count) for k in numbers])
+
     share, mean_m = scenario.radio.independent_multipath
     if share:
         rng = stream(seed, "multipath")
         hit = rng.random(count) < share
         excess = np.where(hit, rng.exponential(mean_m, count), 0.0)
     return Draws(
-        transmit=np.array([stream(seed, "transmit noise", k).normal(size=count) for k in numbers]),
-        receive=np.array([stream(seed, "receive noise", k).normal(size=count) for k in numbers]),
-        reply_s=draw_reply_s(scenario, stream(seed, "reply latency"), count),
+        slot=np.arange(count),
+        transmit=noise("transmit noise", numbers),
+        receive=noise("receive noise", numbers),
+        power=noise("power reading", (1, 2)),
+        skew=noise("skew reading", (1, 2)),
+        reply_s=scenario.ranging.reply.draw_s(stream(seed, "reply latency"), count),
         excess_m=excess,
     )
 
 
 def one_departure(draws: Draws, listeners: int) -> Draws:
     """Return draws with the same noise of departure in all rows of a frame."""
-    return replace(draws, transmit=np.repeat(draws.transmit[:, ::listeners], listeners, axis=1))
-
-
-def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Floats:
-    """Draw reply latencies (count,) whose quantiles are those measured on boards (firmware wire format, 3.4).
-
-    Two modes near 304.1 and 305.9 us, a shoulder, and a tenth delayed by the board's reading of its USB buffer.
-    """
-    reply = scenario.ranging.reply
-    if reply.model == "fixed":
-        return np.full(count, reply.delay_us * 1e-6)
-    if reply.model == "quantiles":
-        return reply.at_s(rng.random(count))
-    kind = rng.random(count)
-    microseconds = np.select(
-        [kind < 0.41, kind < 0.86, kind < 0.91],
-        [rng.normal(0.6, 0.3, count), rng.normal(2.4, 0.7, count), rng.normal(4.8, 0.7, count)],
-        rng.uniform(6.5, 83.0, count),
-    )
-    return np.asarray((303.5 + np.maximum(microseconds, -0.1)) * 1e-6)
+    return replace(draws, transmit=np.repeat(draws.transmit[::listeners], listeners, axis=0))
 
 
 def stamp(medium: Medium, protocol: RangingProtocol, begun: Schedule, draws: Draws) -> Stamped:
     """Return the stamps of exchanges that begin at known instants, message after message."""
-    result = Stamped({}, [], [], draws.excess_m)
+    result = Stamped({}, [], [], draws)
     ends = (begun.initiator, begun.target)
     for k, message in enumerate(protocol.messages):
         sender, receiver = ends if message.sender == "initiator" else ends[::-1]
@@ -124,9 +114,9 @@ def stamp(medium: Medium, protocol: RangingProtocol, begun: Schedule, draws: Dra
             counter = scheduled_counter(result.stamps[message.after], medium.scenario.ranging.response_delay_uus)
         else:
             counter = reply_counter(result.stamps[message.after], draws.reply_s)
-        left = medium.leave(sender, counter + medium.tx_register[sender], draws.transmit[k])
+        left = medium.leave(sender, counter + medium.tx_register[sender], draws.transmit[:, k])
         frames = Frames(sender=sender, receiver=receiver, departure=left)
-        received, link = medium.receive(frames, draws.receive[k], draws.excess_m)
+        received, link = medium.receive(frames, draws.receive[:, k], draws.excess_m)
         added = medium.reply_constant if message.timing == "scheduled" else medium.tx_register
         result.stamps[f"tx{k + 1}"] = counter + added[sender]
         result.stamps[f"rx{k + 1}"] = received
@@ -153,20 +143,19 @@ def next_grid(ticks: Ticks) -> Ticks:
     return -(-ticks // DELAYED_TX_GRID) * DELAYED_TX_GRID
 
 
-def reported_exchanges(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped: Stamped) -> Exchanges:
-    """Return the reports of the `kept` exchanges (n,), of all `planned`: stamps wrapped, ranges as printed."""
-    ids = np.array([tag.id for tag in medium.scenario.tags], dtype=np.int64)
-    none = np.zeros(len(kept), dtype=np.int64)
+def reported_exchanges(medium: Medium, stamped: Stamped) -> dict[str, Any]:
+    """Return what boards report of n exchanges: stamps wrapped, ranges as printed; and their true distances."""
+    ids, poll = np.array([tag.id for tag in medium.scenario.tags], dtype=np.int64), stamped.frames[0]
+    count = len(poll.sender)
+    none, nan = np.zeros(count, dtype=np.int64), np.full(count, np.nan)
     stamps: dict[str, Ints] = {name: stamped.stamps.get(name, none) & MASK for name in STAMPS}
-    fpp1, skew1 = printed_readings(medium, 1, kept, planned, stamped)
-    fpp2, skew2 = printed_readings(medium, 2, kept, planned, stamped)
-    nan = np.full(len(kept), np.nan)
+    (fpp1, skew1), (fpp2, skew2) = (printed_readings(medium, message, stamped) for message in (0, 1))
     found = Exchanges(
-        time_ns=time_ns(stamped.frames[0].departure),
-        initiator=ids[rows.initiator],
-        target=ids[rows.target],
-        protocol=np.full(len(kept), medium.scenario.ranging.protocol),
-        reporter=ids[rows.initiator],
+        time_ns=time_ns(poll.departure),
+        initiator=ids[poll.sender],
+        target=ids[poll.receiver],
+        protocol=np.full(count, medium.scenario.ranging.protocol),
+        reporter=ids[poll.sender],
         range_m=nan,
         fpp1_dbm=fpp1,
         fpp2_dbm=fpp2,
@@ -177,26 +166,28 @@ def reported_exchanges(medium: Medium, kept: Ints, planned: int, rows: Schedule,
         **stamps,
     )
     printed = board_range if medium.scenario.radio.quantize else raw_range
-    return replace(found, range_m=printed(found))
+    exchanges = replace(found, range_m=printed(found))
+    truth_m = (stamped.links[0].distance_m + stamped.links[1].distance_m) / 2
+    return {"exchanges": exchanges, "overheard": overhear(medium, stamped, exchanges), "truth_m": truth_m}
 
 
-def reported_broadcasts(medium: Medium, kept: Ints, planned: int, rows: Schedule, stamped: Stamped) -> dict[str, Any]:
-    """Return what tags report of the `kept` rows (n,), of all `planned`: receptions, and the exchanges that they make.
+def reported_broadcasts(medium: Medium, stamped: Stamped) -> dict[str, Any]:
+    """Return what tags report of n frames, each at one listener: receptions, and the exchanges that they make.
 
     Stamps are the chip's whole ones. `truth_m` are the distances at the polls, which ranges measure (`range_ns`).
     """
-    ids = np.array([tag.id for tag in medium.scenario.tags], dtype=np.int64)
-    fpp, skew = printed_readings(medium, 1, kept, planned, stamped)
+    ids, frame = np.array([tag.id for tag in medium.scenario.tags], dtype=np.int64), stamped.frames[0]
+    fpp, skew = printed_readings(medium, 0, stamped)
     tx, rx = (stamped.stamps[name] & ((1 << COUNTER_BITS) - 1) for name in ("tx1", "rx1"))
     receptions = Receptions(
-        time_ns=time_ns(stamped.frames[0].departure),
-        frame=kept // (len(ids) - 1),
-        sender=ids[rows.initiator],
-        listener=ids[rows.target],
+        time_ns=time_ns(frame.departure),
+        frame=stamped.draws.slot // (len(ids) - 1),
+        sender=ids[frame.sender],
+        listener=ids[frame.receiver],
         tx=tx,
         rx=rx,
         fpp_dbm=fpp,
-        rxp_dbm=np.full(len(kept), np.nan),
+        rxp_dbm=np.full(len(fpp), np.nan),
         skew_ppm=skew,
     )
     exchanges, overheard = exchanges_in(receptions)
@@ -211,12 +202,10 @@ def time_ns(departure: Ints) -> Ints:
     return np.asarray(np.rint(departure * (NS_PER_S / SUBTICKS_PER_SECOND)).astype(np.int64))
 
 
-def printed_readings(medium: Medium, number: int, kept: Ints, planned: int, stamped: Stamped) -> tuple[Floats, Floats]:
-    """Return what receivers print of message `number`: first-path power and relative skew, (n,) each."""
-    seed = medium.scenario.run.seed
-    power_noise = stream(seed, "power reading", number).normal(size=planned)[kept]
-    skew_noise = stream(seed, "skew reading", number).normal(size=planned)[kept]
-    return medium.readings(stamped.frames[number - 1], stamped.links[number - 1].power_dbm, power_noise, skew_noise)
+def printed_readings(medium: Medium, message: int, stamped: Stamped) -> tuple[Floats, Floats]:
+    """Return what receivers print of a message, by its index: first-path power and relative skew, (n,) each."""
+    power, skew = stamped.draws.power[:, message], stamped.draws.skew[:, message]
+    return medium.readings(stamped.frames[message], stamped.links[message].power_dbm, power, skew)
 
 
 def reported_faults(scenario: Scenario, plan: Schedule, outcomes: Outcomes) -> list[Fault]:
@@ -240,7 +229,7 @@ def reported_faults(scenario: Scenario, plan: Schedule, outcomes: Outcomes) -> l
 def provenance(scenario: Scenario) -> dict[str, Any]:
     """Return a recording's `meta` of a simulated flight: the scenario whole, its seed, and what it planted."""
     # Channel effects of plug-ins are not part of the scenario, but the flight cannot be repeated without them.
-    added = [name for name in CHANNEL_EFFECTS if name not in OWN_EFFECTS]
+    added = [effect.name for effect in CHANNEL_EFFECTS.added()]
     # Antenna delays programmed into tags: the default under None, others by the ids of their tags.
     by_tag = {tag.id: AntennaDelay(**tag.antenna_delay.model_dump()) for tag in scenario.tags}
     delays: AntennaDelays = {None: AntennaDelay(), **{k: one for k, one in by_tag.items() if one != AntennaDelay()}}
@@ -298,7 +287,7 @@ def responses(
     """
     last = max(k for k, message in enumerate(protocol.messages) if message.sender == "target")
     sent = stamped.frames[last]
-    heard = world.paths(sent.sender, sent.receiver, sent.departure, stamped.detour_m)
+    heard = world.paths(sent.sender, sent.receiver, sent.departure, stamped.draws.excess_m)
     columns = (exchanges.initiator, exchanges.target, getattr(exchanges, f"rx{last + 1}"), exchanges.time_ns)
     rng, rows = stream(scenario.run.seed, "impulse responses"), []
     for initiator, target, rx, time_ns, paths in zip(*(c.tolist() for c in columns), heard, strict=True):

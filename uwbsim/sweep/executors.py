@@ -14,7 +14,7 @@ import platform
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     CancelledError,
@@ -25,7 +25,8 @@ from concurrent.futures import (
 )
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from multiprocessing.connection import Connection
 from threading import Thread
@@ -35,15 +36,15 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import uwblink
-from uwblink.errors import UwblinkError
+from uwblink.errors import UwblinkError, raising
 from uwblink.output import interrupts_held
-from uwblink.protocols.table import PROTOCOLS, RangingProtocol, register_protocol
+from uwblink.protocols.table import PROTOCOLS, RangingProtocol
 from uwbsim.errors import ParameterError, UwbsimError
 from uwbsim.protocols.comparison import compare
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import Simulated, simulate
 from uwbsim.sweep.design import EVALUATORS, Run, evaluators
-from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, ChannelEffect
+from uwbsim.world.channel import CHANNEL_EFFECTS, ChannelEffect
 
 Evaluate = Callable[[Simulated], Mapping[str, Any]]
 """Returns the results of a flight as columns of one row: numbers, texts or None."""
@@ -60,8 +61,9 @@ Done = tuple[Chunk, list[Result] | None, float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Work:
-    """What all runs of a sweep have in common: name of the scenario, protocols, evaluation, and plug-ins.
+    """What all runs of a sweep have in common: name of the scenario, protocols, evaluation, and channel effects.
 
+    The effects are those that programs and other distributions have added in the process that makes it.
     With `evaluate` each protocol's flight is simulated and evaluated; without, protocols are compared by `ranges`.
     """
 
@@ -69,20 +71,13 @@ class Work:
     protocols: tuple[RangingProtocol, ...]
     ranges: int
     evaluate: Evaluate | None = None
-    effects: tuple[tuple[str, ChannelEffect], ...] = ()
-
-    @classmethod
-    def of_here(cls, name: str, protocols: Iterable[str], ranges: int, evaluate: Evaluate | None = None) -> Work:
-        """Return the work of a sweep with the protocols and channel effects that are registered in this process."""
-        effects = tuple((name, effect) for name, effect in CHANNEL_EFFECTS.items() if name not in OWN_EFFECTS)
-        rows = tuple(PROTOCOLS[name] for name in protocols)
-        return cls(name=name, protocols=rows, ranges=ranges, evaluate=evaluate, effects=effects)
+    effects: tuple[ChannelEffect, ...] = field(default_factory=lambda: tuple(CHANNEL_EFFECTS.added()))
 
     def check(self) -> None:
         """Raise `ParameterError` for a function that another process cannot import by its name."""
         parts = ("flight_ticks", "delay_weights")
         named: dict[str, object] = {
-            **{f"channel effect {name!r}": effect for name, effect in self.effects},
+            **{f"channel effect {effect.name!r}": effect.apply for effect in self.effects},
             **{f"{part} of protocol {row.name!r}": getattr(row, part) for row in self.protocols for part in parts},
             **({} if self.evaluate is None else {"evaluate": self.evaluate}),
         }
@@ -135,12 +130,8 @@ class Work:
 def run_chunk(runs: Sequence[Run], work: Work) -> tuple[list[Result], float]:
     """Do some runs; return their results, and the seconds that they took together."""
     start = time.perf_counter()
-    # Registrations of this process are kept.
-    for row in work.protocols:
-        if row.name not in PROTOCOLS:
-            register_protocol(row)
-    for name, effect in work.effects:
-        CHANNEL_EFFECTS.setdefault(name, effect)
+    PROTOCOLS.adopt(work.protocols)
+    CHANNEL_EFFECTS.adopt(work.effects)
     # One thread of linear algebra for each worker, so that results do not depend on the number of cores.
     with threadpool_limits(limits=1, user_api="blas"):
         return [work.do(run) for run in runs], time.perf_counter() - start
@@ -155,12 +146,9 @@ def evaluator(kind: str) -> Evaluate:
             f"one (entry point {kind!r} of the group {EVALUATORS})",
             parameter="evaluate",
         )
-    try:
+    what = f"{entry.value}, which {EVALUATORS} names, cannot be imported"
+    with raising(partial(ParameterError, parameter="evaluate"), what, ImportError, AttributeError):
         found: Evaluate = entry.load()
-    except (ImportError, AttributeError) as error:
-        raise ParameterError(
-            f"{entry.value}, which {EVALUATORS} names, cannot be imported: {error}", parameter="evaluate"
-        ) from error
     return found
 
 
@@ -282,20 +270,15 @@ class Cluster(Workers):
         """Connect; raises `ParameterError` where no scheduler answers in time."""
         work.check()
         self._address = address
-        try:
+        refused = partial(ParameterError, parameter="scheduler")
+        with raising(refused, "needs the extra 'cluster'", ImportError, remedy=": pip install 'uwbcal[cluster]'"):
             dask: Any = import_module("distributed")
-        except ImportError as error:
-            raise ParameterError(
-                "needs the extra 'cluster': pip install 'uwbcal[cluster]'", parameter="scheduler"
-            ) from error
         self.died = dask.KilledWorker
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
-        try:
+        with raising(
+            refused, f"{address} does not answer within {self.connect_s} s", OSError, TimeoutError, ValueError
+        ):
             self._client = dask.Client(address, timeout=self.connect_s, set_as_default=False)
-        except (OSError, TimeoutError, ValueError) as error:
-            raise ParameterError(
-                f"{address} does not answer within {self.connect_s} s", parameter="scheduler"
-            ) from error
         super().__init__(max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1), work)
 
     def _start_pool(self) -> Any:

@@ -10,9 +10,8 @@ import json
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, Self
@@ -21,8 +20,9 @@ import duckdb
 
 import uwblink
 from uwblink.database import connect, write_tables
-from uwblink.errors import UwblinkError, first_line
+from uwblink.errors import UwblinkError, first_line, raising
 from uwblink.output import check_folder, is_utf8
+from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.store import check_tables
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.sweep.design import SweepDesign
@@ -91,16 +91,14 @@ def run_sweep(
         )
     if workers is not None and workers < 1:
         raise ParameterError(f"found {workers}, expected 1 or more", parameter="workers")
-    work = Work.of_here(plan.scenario.stem, plan.protocols, plan.settings.ranges, evaluate)
-    team = workers_for(workers, scheduler, work)
-    try:
+    rows = tuple(PROTOCOLS[name] for name in plan.protocols)
+    work = Work(name=plan.scenario.stem, protocols=rows, ranges=plan.settings.ranges, evaluate=evaluate)
+    with closing(workers_for(workers, scheduler, work)) as team:
         folder.mkdir(exist_ok=True)
         with ResultStore.open(folder / STORE, _identity(plan)) as store:
             known = store.done()
             done, failed = _do(plan, store, team, work, known, progress)
             write_tables(folder / "results.csv", folder / "results.parquet", store, force=True)
-    finally:
-        team.close()
     return SweepSummary(done, failed, len(known))
 
 
@@ -260,16 +258,14 @@ class ResultStore:
                     yield row
 
 
-@contextmanager
-def _naming(path: Path, text: str) -> Iterator[None]:
-    """Raise errors of a store as a `TableError` that names it; `text` has a place for the reason."""
-    try:
-        yield
-    except UwblinkError:
-        raise
-    except (duckdb.Error, ValueError, TypeError, KeyError, RecursionError) as error:
-        raise TableError(f"{path}: {text.format(first_line(error))}") from error
+UNUSABLE: Final = (duckdb.Error, ValueError, TypeError, KeyError, RecursionError)
+"""Errors of a store whose file is damaged, or cannot be written."""
 
 
-_reading: Final = partial(_naming, text="its results are damaged ({}); begin in another folder")
-_writing: Final = partial(_naming, text="cannot be written ({}); is the disk full? Results so far are kept")
+def _reading(path: Path) -> AbstractContextManager[None]:
+    return raising(TableError, f"{path}: its results are damaged", *UNUSABLE, remedy="; begin in another folder")
+
+
+def _writing(path: Path) -> AbstractContextManager[None]:
+    remedy = "; is the disk full? Results so far are kept"
+    return raising(TableError, f"{path}: cannot be written", *UNUSABLE, remedy=remedy)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
-from pydantic import ValidationError
 from scipy.special import kolmogi, kolmogorov, ndtr, ndtri
 from scipy.stats import ks_2samp
 from threadpoolctl import threadpool_limits
@@ -21,6 +20,7 @@ from uwblink.recording.schema import Poses, Tag
 from uwblink.ticks import TICK_S
 from uwblink.twr import intervals
 from uwbsim.errors import ParameterError, ScenarioError
+from uwbsim.scenario.loading import validated
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import simulate
 from uwbsim.twins.clocks import fit_clocks
@@ -306,14 +306,8 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
     )
     name = f"twin of {Path(where).stem}"
     table, paths = tables(flight, known, flown.poses, fitted, name)
-    try:
-        scenario = Scenario.model_validate(table)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise ScenarioError(f"{where}: the fitted scenario is not valid: {place}: {first['msg']}") from error
     return Twin(
-        scenario=scenario,
+        scenario=validated(Scenario, table, f"{where}: the fitted scenario is not valid"),
         found=summary(flight, fitted),
         unknown=tuple(unknowns(flight, fitted)),
         measured=flight,

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from uwblink.arrays import Floats
 from uwblink.errors import restating
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import Exchanges, intervals
 from uwbsim.errors import ScenarioError, TooFewDataError
+from uwbsim.scenario.loading import validated
 from uwbsim.scenario.radio import Spline, TwoStateMultipath
 from uwbsim.twins.flight import TwinFlight, lasting
 
@@ -74,10 +74,8 @@ def read_calibration(source: CalibrationSource) -> KnownDevices:
     # Scenarios lift powers with alpha = -82 dBm. With another alpha, 10^((p - alpha)/10) differs by this factor.
     scale, curve = 10 ** ((found.alpha_dbm + 82.0) / 10), found.bias_curve
     knots = tuple(knot * scale for knot in curve.knots)
-    try:
-        bias = Spline(knots=knots, coefficients=curve.coefficients, degree=curve.degree)
-    except ValidationError as error:
-        raise ScenarioError(f"{where}: bias_curve: {error.errors()[0]['msg']}") from error
+    table = {"knots": knots, "coefficients": curve.coefficients, "degree": curve.degree}
+    bias = validated(Spline, table, f"{where}: bias_curve")
     return KnownDevices(where=where, calibration=found, bias=bias)
 
 

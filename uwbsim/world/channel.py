@@ -7,12 +7,15 @@ of `CHANNEL_EFFECTS` applies to all of them equally.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from uwblink.arrays import ArrayRows, Floats, Ints
+from uwblink.errors import ArgumentError, restating
+from uwblink.plugins import Registry, check_row
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.scenario.bodies import Room, Shadow
@@ -24,6 +27,7 @@ from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.radio import antenna_gain_db, group_delay_m, path_gain_db
 
 if TYPE_CHECKING:
+    from uwbsim.world.geometric import GeometricResponses
     from uwbsim.world.world import World
 
 
@@ -147,22 +151,49 @@ def paths_heard(link: Link, ends: Ends, detour_m: Floats) -> list[PathsHeard]:
     ]
 
 
-ChannelEffect = Callable[[Link, Ends], Link]
+Effect = Callable[[Link, Ends], Link]
 """Returns n links between given ends after an effect; `dataclasses.replace` keeps what it does not change."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelEffect:
+    """An effect by its name; an entry point of the group `uwbcal.effects` names one, or a list of them."""
+
+    name: str
+    apply: Effect
 
 
 def link_between(ends: Ends) -> Link:
     """Return the links between known ends, (n,), after all effects of `CHANNEL_EFFECTS` in their order."""
-    power = nothing = np.zeros_like(ends.distance_m)
-    if ends.world.responses is None:  # geometric responses also have the powers
-        gain = ends.gain_towards_db(ends.towards, -ends.towards)
-        power = path_gain_db(ends.scenario.radio, ends.distance_m) + gain
-    link = Link(ends.distance_m, nothing, power, power, ends.distance_m[:, None], power[:, None])
-    for name, effect in CHANNEL_EFFECTS.items():
-        link = effect(link, ends)
-        if name not in OWN_EFFECTS:
-            _check(name, link, ends)
+    responses = ends.world.responses
+    link = _direct(ends) if responses is None else _of_responses(ends, responses)
+    for effect in OWN_EFFECTS:
+        link = effect.apply(link, ends)
+    for effect in CHANNEL_EFFECTS.added():
+        with CHANNEL_EFFECTS.calling(effect.name, ScenarioError):
+            link = effect.apply(link, ends)
+        _check(effect.name, link, ends)
     return link
+
+
+def _direct(ends: Ends) -> Link:
+    """Return links with direct paths alone, weaker and longer by what they cross: obstacles, bodies with a shadow."""
+    scenario, distance, towards = ends.scenario, ends.distance_m, ends.towards
+    power = path_gain_db(scenario.radio, distance) + ends.gain_towards_db(towards, -towards)
+    link = Link(distance, np.zeros_like(distance), power, power, distance[:, None], power[:, None])
+    if scenario.obstacles:
+        loss, excess = box_loss(scenario.obstacles, *ends.antennas_m)
+        link = replace(link.weaker(loss), excess_m=excess, paths_m=(distance + excess)[:, None])
+    for body in ends.shadows:
+        link = link.weaker(body.loss_db(*(spots[:, None] for spots in ends.antennas_m))[:, 0])
+    return link
+
+
+def _of_responses(ends: Ends, responses: GeometricResponses) -> Link:
+    """Return links with excess length, powers and noise of geometric responses, which have their own paths."""
+    distance, read = ends.distance_m, responses.at(ends.places, ends.time_s)
+    nothing = np.zeros((len(distance), 1))
+    return Link(distance, read.excess_m, read.power_dbm, read.total_dbm, distance[:, None], nothing, read.noise_s)
 
 
 def _check(name: str, link: Link, ends: Ends) -> None:
@@ -176,20 +207,6 @@ def _check(name: str, link: Link, ends: Ends) -> None:
                 f"channel effect {name!r}: {column}: returned {values!r:.60}, expected {len(ends.distance_m)} finite "
                 "numbers"
             )
-
-
-def _obstacles(link: Link, ends: Ends) -> Link:
-    if not ends.scenario.obstacles or ends.world.responses is not None:
-        return link
-    loss, excess = box_loss(ends.scenario.obstacles, *ends.antennas_m)
-    return replace(link.weaker(loss), excess_m=excess, paths_m=(link.distance_m + excess)[:, None])
-
-
-def _shadows(link: Link, ends: Ends) -> Link:
-    """Apply the loss of bodies on the direct path, before the first path is chosen."""
-    for body in ends.shadows if ends.world.responses is None else ():
-        link = link.weaker(body.loss_db(*(spots[:, None] for spots in ends.antennas_m))[:, 0])
-    return link
 
 
 def _reflections(link: Link, ends: Ends) -> Link:
@@ -268,14 +285,6 @@ def _states(link: Link, ends: Ends) -> Link:
     )
 
 
-def _response(link: Link, ends: Ends) -> Link:
-    """Use excess length, powers and noise of geometric responses; the effects above skip links with one."""
-    if ends.world.responses is None:
-        return link
-    read = ends.world.responses.at(ends.places, ends.time_s)
-    return replace(link, **{column.name: getattr(read, column.name) for column in fields(read)})
-
-
 def _levels(link: Link, ends: Ends) -> Link:
     """Apply fading and outages of pairs to all paths."""
     if not ends.world.levels:
@@ -293,23 +302,25 @@ def _group_delays(link: Link, ends: Ends) -> Link:
     return replace(link, excess_m=link.excess_m + late, paths_m=link.paths_m + late[:, None])
 
 
-CHANNEL_EFFECTS: Final[dict[str, ChannelEffect]] = {
-    "obstacles": _obstacles,
-    "shadows": _shadows,
-    "reflections": _reflections,
-    "lasting reflections": _states,
-    "response": _response,
-    "fading and outages": _levels,
-    "group delays": _group_delays,
-}
-"""Effects on every link of every scenario, in this order; effects of plug-ins are last."""
+OWN_EFFECTS: Final = (
+    ChannelEffect("reflections", _reflections),
+    ChannelEffect("lasting reflections", _states),
+    ChannelEffect("fading and outages", _levels),
+    ChannelEffect("group delays", _group_delays),
+)
+"""The project's own effects, in this order, which depend only on the scenario."""
 
-OWN_EFFECTS: Final = tuple(CHANNEL_EFFECTS)
-"""Effects that depend only on the scenario."""
+CHANNEL_EFFECTS: Final[Registry[ChannelEffect]] = Registry(
+    "channel effect",
+    "uwbcal.effects",
+    OWN_EFFECTS,
+    partial(check_row, "channel effect", ChannelEffect, {"apply": (callable, "a function of link and ends")}),
+)
+"""Effects on every link of every scenario: the project's, then those of programs and of installed distributions."""
 
 
-def register_channel_effect(name: str, effect: ChannelEffect) -> None:
-    """Add an effect to every link that is simulated from now on; `del CHANNEL_EFFECTS[name]` removes it.
+def register_channel_effect(name: str, effect: Effect) -> None:
+    """Add an effect to every link that is simulated from now on; `CHANNEL_EFFECTS.remove` removes it.
 
     `effect(link, ends)` gets n links (`Link`: distances and excess lengths in metres, powers in dBm, (n,) each) and
     their two ends (`Ends`), and returns links. It must not depend on anything else, so that the same seed gives the
@@ -323,14 +334,7 @@ def register_channel_effect(name: str, effect: ChannelEffect) -> None:
     >>> uwbsim.register_channel_effect("rain", rain)
     >>> [*CHANNEL_EFFECTS][-3:]
     ['fading and outages', 'group delays', 'rain']
-    >>> del CHANNEL_EFFECTS["rain"]
+    >>> CHANNEL_EFFECTS.remove("rain")
     """
-    if not isinstance(name, str) or not name:
-        raise ParameterError(f"found {name!r:.40}, expected a word", parameter="name")
-    if name in CHANNEL_EFFECTS:
-        raise ParameterError(
-            f"found {name!r}, which is taken; the effects are {', '.join(CHANNEL_EFFECTS)}", parameter="name"
-        )
-    if not callable(effect):
-        raise ParameterError(f"found {effect!r}, expected a function of link and ends", parameter="effect")
-    CHANNEL_EFFECTS[name] = effect
+    with restating(ParameterError, ArgumentError):
+        CHANNEL_EFFECTS.register(ChannelEffect(name, effect))

@@ -28,7 +28,7 @@ from scipy.special import ndtri
 from uwblink.arrays import Columns, Floats, Ints, in_time_order
 from uwblink.ticks import COUNTER_BITS, TICKS_PER_SECOND
 from uwbsim.random_streams import stream
-from uwbsim.scenario.devices import Devices, Profile, ProfileTable, Ramp, ScenarioTag, WarmUp
+from uwbsim.scenario.devices import Devices, Profile, ScenarioTag
 from uwbsim.scenario.model import Scenario
 
 NS_PER_S: Final = 1_000_000_000
@@ -220,20 +220,6 @@ class Clocks:
         return np.rint(self.skew[tag] * time + walked).astype(np.int64)
 
 
-def profile_at(profile: Profile, time_s: Floats) -> Floats:
-    """Return a profile's values at times (n,)."""
-    time_s = np.asarray(time_s, dtype=np.float64)
-    if isinstance(profile, Ramp):
-        share = np.clip((time_s - profile.begin_s) / profile.duration_s, 0, 1)
-        return np.asarray(profile.start + (profile.end - profile.start) * share)
-    if isinstance(profile, WarmUp):
-        left = np.exp(-np.maximum(time_s - profile.begin_s, 0) / profile.time_constant_s)
-        return np.asarray(profile.end + (profile.start - profile.end) * left)
-    if isinstance(profile, ProfileTable):
-        return np.asarray(np.interp(time_s, profile.times_s, profile.values))
-    return np.full(time_s.shape, profile.value)
-
-
 def profile_of(scenario: Scenario, tag: ScenarioTag, key: str) -> Profile | None:
     """Return the `temperature_c` or `supply_v` of a tag, or of its body; None where it is not known."""
     found: Profile | None = getattr(tag, key)
@@ -246,17 +232,18 @@ def slope_of(tag: ScenarioTag, devices: Devices, name: str) -> float:
     return float(getattr(devices, name) if value is None else value)
 
 
-def range_shift_m(scenario: Scenario, tag: ScenarioTag, time_s: Floats) -> Floats | None:
-    """Return the change of ranges by a tag's temperature and voltage at times (n,); None for a tag without
-    an effect.
-    """
+RangeEffect = tuple[Profile, float, float]
+"""A quantity over time on which ranges depend, their slope in metres per unit, and its reference."""
+
+
+def range_effects(scenario: Scenario, tag: ScenarioTag) -> list[RangeEffect]:
+    """Return the effects of a tag's temperature and voltage on ranges; none without a profile or a slope."""
     d = scenario.devices
     effects = (
         (profile_of(scenario, tag, "temperature_c"), slope_of(tag, d, "range_mm_per_k") * 1e-3, d.reference_c),
         (profile_of(scenario, tag, "supply_v"), slope_of(tag, d, "range_cm_per_v") * 1e-2, d.reference_v),
     )
-    parts = [slope * (profile_at(profile, time_s) - ref) for profile, slope, ref in effects if profile and slope]
-    return np.sum(parts, axis=0) if parts else None
+    return [(profile, slope, reference) for profile, slope, reference in effects if profile and slope]
 
 
 def thermal_rate(scenario: Scenario, tag: ScenarioTag, time_s: Floats) -> Floats:
@@ -264,7 +251,7 @@ def thermal_rate(scenario: Scenario, tag: ScenarioTag, time_s: Floats) -> Floats
     rate = tag.warm_up_ppm * 1e-6 * np.exp(-time_s / tag.warm_up_s)
     profile, slope = profile_of(scenario, tag, "temperature_c"), slope_of(tag, scenario.devices, "skew_ppm_per_k")
     if profile is not None and slope:
-        rate = rate + slope * 1e-6 * (profile_at(profile, time_s) - scenario.devices.reference_c)
+        rate = rate + slope * 1e-6 * (profile.at(time_s) - scenario.devices.reference_c)
     return np.asarray(rate)
 
 
@@ -282,7 +269,7 @@ def readings(scenario: Scenario) -> Columns:
         if any(profile is not None for profile in profiles):
             drawn = stream(scenario.run.seed, "temperature readings", tag.id).normal(size=(2, len(time_s)))
             read = [
-                np.full(len(time_s), np.nan) if profile is None else profile_at(profile, time_s) + noise * scatter
+                np.full(len(time_s), np.nan) if profile is None else profile.at(time_s) + noise * scatter
                 for profile, noise, scatter in zip(profiles, noises, drawn, strict=True)
             ]
             time_ns = np.rint(time_s * NS_PER_S).astype(np.int64)

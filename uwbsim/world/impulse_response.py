@@ -91,8 +91,7 @@ def peak_amplitude(power_dbm: float) -> float:
     The power is 10 log10((F1^2 + F2^2 + F3^2)/N^2) - 121.74 of the three taps after the leading edge; the chip
     accumulates N = 118 of the 128 symbols of the preamble.
     """
-    squares = float(np.sum(np.exp(-2 * ((OWN_TAPS - EDGE_TO_PEAK) / PULSE_TAPS) ** 2)))
-    return float(118 * np.sqrt(10 ** ((power_dbm + FPP_OFFSET_DB) / 10) / squares))
+    return float(118 * np.sqrt(10 ** ((power_dbm + FPP_OFFSET_DB) / 10) / _squares(OWN_TAPS)))
 
 
 def impulse_response(rng: np.random.Generator, stamp: int, paths: PathsHeard) -> tuple[int, tuple[int, ...]]:

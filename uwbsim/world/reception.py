@@ -16,7 +16,7 @@ from uwblink.ticks import SPEED_OF_LIGHT, TX_SHARE
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Radio
 from uwbsim.world.channel import Link
-from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks, range_shift_m
+from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks, RangeEffect, range_effects
 from uwbsim.world.radio import (
     printed_power_dbm,
     printed_skew_ppm,
@@ -37,16 +37,14 @@ class AntennaDelays:
     delays receive stamps.
     """
 
-    scenario: Scenario
     fixed: Floats
-    variable: tuple[int, ...]
+    variable: dict[int, list[RangeEffect]]
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
         """Return the antenna delays of a scenario's tags."""
-        start = np.zeros(1)
-        variable = [k for k, tag in enumerate(scenario.tags) if range_shift_m(scenario, tag, start) is not None]
-        return cls(scenario, np.array([tag.delays_ns() for tag in scenario.tags]) * 1e-9, tuple(variable))
+        variable = {k: found for k, tag in enumerate(scenario.tags) if (found := range_effects(scenario, tag))}
+        return cls(np.array([tag.delays_ns() for tag in scenario.tags]) * 1e-9, variable)
 
     def transmit_s(self, tag: Ints, time: Ints) -> Floats:
         """Return the errors of the transmit stamps of tags (n,) at true times (n,) in sub-ticks, in seconds."""
@@ -59,10 +57,11 @@ class AntennaDelays:
     def _variable_s(self, tag: Ints, time: Ints) -> Floats:
         """Return the effect of temperature and voltage on a transmission and a reception together, (n,) seconds."""
         total = np.zeros(len(tag))
-        for place in self.variable:
+        for place, effects in self.variable.items():
             rows = np.flatnonzero(tag == place)
-            shift_m = range_shift_m(self.scenario, self.scenario.tags[place], time[rows] / SUBTICKS_PER_SECOND)
-            total[rows] = 0.0 if shift_m is None else 2 * shift_m / SPEED_OF_LIGHT
+            time_s = time[rows] / SUBTICKS_PER_SECOND
+            shift_m = np.sum([slope * (profile.at(time_s) - ref) for profile, slope, ref in effects], axis=0)
+            total[rows] = 2 * shift_m / SPEED_OF_LIGHT
         return total
 
 

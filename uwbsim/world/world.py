@@ -21,7 +21,7 @@ from uwblink.recording.schema import Poses
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.radio import GeometricMultipath, TwoStateMultipath
+from uwbsim.scenario.radio import Fading, GeometricMultipath, Outages, TwoStateMultipath
 from uwbsim.world.channel import Ends, Link, PlacedBody, link_between, paths_heard
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS_PER_SECOND
 from uwbsim.world.geometric import GeometricResponses
@@ -90,23 +90,14 @@ def _instants(rng: np.random.Generator, life_s: float, span_s: float) -> Floats:
 
 def pair_levels(scenario: Scenario) -> list[PairStates]:
     """Draw fading and outages (`radio.fading`, `radio.outages`) over a run: changes of power, in dB, (1, states)."""
-    fading, outages, found = scenario.radio.fading, scenario.radio.outages, []
-    if fading is not None:
+    models = {"fading": scenario.radio.fading, "outages": scenario.radio.outages}
+    return [_levels_of(scenario, purpose, model) for purpose, model in models.items() if model is not None]
 
-        def fades(_ids: list[int], draw: Draw, count: int) -> Floats:
-            rng = draw("levels")
-            if not fading.levels_db:
-                return fading.std_db * rng.standard_normal((1, count))
-            return np.interp(rng.random((1, count)), np.linspace(0, 1, len(fading.levels_db)), fading.levels_db)
 
-        found.append(PairStates.draw(scenario, "fading", lambda *_: fading.life_s, fades))
-    if outages is not None:
-
-        def silences(_ids: list[int], draw: Draw, count: int) -> Floats:
-            return np.where(draw("levels").random((1, count)) < outages.share, -80.0, 0.0)  # below any sensitivity
-
-        found.append(PairStates.draw(scenario, "outages", lambda *_: outages.life_s, silences))
-    return found
+def _levels_of(scenario: Scenario, purpose: str, model: Fading | Outages) -> PairStates:
+    return PairStates.draw(
+        scenario, purpose, lambda *_: model.life_s, lambda _, draw, count: model.draw_db(draw("levels"), count)
+    )
 
 
 def reflected_states(scenario: Scenario, model: TwoStateMultipath) -> PairStates:

@@ -72,6 +72,16 @@ def test_the_command_prints_findings_clocks_and_p_values(tmp_path):
     assert all(abs(one["stamps_ppm"] - one["carrier_ppm"]) < 0.1 for one in skews)
 
 
+@pytest.mark.parametrize("command", ["doctor", "fit"])
+def test_a_recording_that_is_given_twice_is_refused_under_any_name(tmp_path, command):
+    paths = [save(fly(Plan(seconds=5, per_second=60), 94, 5), tmp_path / name) for name in ("one.uwb", "other.uwb")]
+    output = ["-o", tmp_path / "calibration.json"] if command == "fit" else []
+    for second in (paths[0], paths[1]):
+        same = f"{second.name}: contains the same exchanges as one.uwb"
+        processes.refuse("calib", command, paths[0], second, *output, naming=[same])
+    assert not (tmp_path / "calibration.json").exists()
+
+
 STAMPS = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
 STARLOC = ["time_s", "from_id", "to_id", *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "range"]
 STARLOC_DATA = "starloc_loop-2d-fast.tar.xz"

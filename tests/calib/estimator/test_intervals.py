@@ -14,6 +14,7 @@ from calib.estimator.covariance import Kept, sandwich
 from calib.estimator.known_distances import fit_known_distances, model_of, robust_fit
 from calib.estimator.score_tests import Slopes
 from calib.estimator.time_blocks import TimeBlocks, persistence, time_blocks
+from calib.spread import students_factor
 from tests.calib import synthetic
 
 
@@ -37,7 +38,9 @@ def test_variances_account_for_fitted_unknowns():
     sums = np.array([scores[cut.number == k].sum(axis=0) for k in range(cut.count)])
     inverse = np.linalg.inv(matrix.T @ matrix)
     plain = inverse @ sums.T @ sums @ inverse * len(ranges) / (len(ranges) - len(tags))
-    np.testing.assert_allclose(whole, plain * lasting.factor * (lasting.quantile95 / 1.959964) ** 2, rtol=2e-3)
+    np.testing.assert_allclose(
+        whole, plain * lasting.factor * (student.ppf(0.975, lasting.freedom) / 1.959964) ** 2, rtol=2e-3
+    )
 
 
 @pytest.mark.slow
@@ -115,7 +118,7 @@ def test_a_short_recording_has_few_degrees_of_freedom():
     few = persistence(walk(0.95, 1.0, rng, blocks=120)[0], blocks(120, 12.0), 3)
     many = persistence(walk(0.6, 1.0, rng, blocks=1000)[0], blocks(1000, 100.0), 3)
     assert few.freedom < many.freedom
-    assert few.quantile95 > many.quantile95 > 1.95
+    assert students_factor(few.freedom) > students_factor(many.freedom) > 0.995
     assert few.stretches < 20 < many.stretches
 
 

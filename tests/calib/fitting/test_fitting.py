@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 import calib
 from calib.estimator.losses import LOSSES, register_loss
+from calib.findings import Finding
 from tests.calib.synthetic import DELAYS_NS, about_their_mean, bias_m, design, ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -302,7 +303,7 @@ matplotlib.use("Agg")
 
 @pytest.fixture(scope="module")
 def result():
-    return replace(calib.fit(ranges(2000)), warnings=["<b>beware</b> of the dog"])
+    return replace(calib.fit(ranges(2000)), findings=[Finding("dog", "<b>beware</b> of the dog", "", None)])
 
 
 def test_results_print_on_a_screen(result):

@@ -48,7 +48,8 @@ def test_exchanged_labels_are_named_and_ranges_determine_the_order(right):
     ):
         found = calib.survey(FIVE.ranges, known=said_with(FIVE, wrong), regardless=True)
         assert [one.fault for one in found.contradictions] == ["exchanged labels"]
-        assert found.findings[0].startswith(text)
+        assert found.contradictions[0].evidence.startswith(text)
+        assert 0 <= (found.contradictions[0].p_value or 0) < 0.01
         assert found.calibration.delays_ns == pytest.approx(right.calibration.delays_ns, abs=1e-3)
 
 

@@ -15,6 +15,7 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 import calib
+import uwblink
 from benchmarks.standing import standing_boards
 from calib.cli.commands import app
 from calib.data.samples import ANCHOR_DELAYS_NS, stamped
@@ -57,7 +58,7 @@ def test_without_noise_delays_and_places_are_exact():
         found = np.array([board.position_m[0] for board in one.boards])
         place = world.places[k][:, 0] - world.places[k][0, 0]
         assert found == pytest.approx(place * np.sign(place[1]), abs=1e-4)
-    assert (result.warnings, result.second_best) == ((), None)
+    assert (result.findings, result.second_best) == ((), None)
 
 
 def assert_sound(world, result):
@@ -284,7 +285,8 @@ def test_wrong_known_facts_are_named(mistake):
     world, known, kind, message = mistake()
     result = calib.survey(world.ranges, known=known, regardless=True)
     assert [one.fault for one in result.contradictions] == [kind]
-    assert re.search(message, result.findings[0])
+    assert re.search(message, result.contradictions[0].evidence)
+    assert 0 <= (result.contradictions[0].p_value or 0) < 0.01
     assert max(map(abs, scores(result, world.delays_ns).values())) < 4
     if kind == "arrangement not as it is said to be":
         assert [one.known for one in result.arrangements] == ["line", "line", "plane", "line", "line"]
@@ -426,6 +428,16 @@ def test_two_arrangements_of_one_name_are_refused_by_flags_that_the_command_has(
     commands: Any = typer.main.get_command(app)
     options = {option for one in commands.commands["survey"].params for option in one.opts}
     assert set(re.findall(r"--[a-z-]+", told)) <= options
+
+
+def test_a_recording_that_is_given_twice_is_refused_under_any_name(recording, tmp_path):
+    with uwblink.Recording.open(recording[0]) as one:
+        unmarked = Contents(exchanges=one.exchanges())
+    paths = [tmp_path / name for name in ("one.uwb", "other.uwb")]
+    for path in paths:
+        unmarked.save(path)
+    with pytest.raises(calib.BadInputError, match=r"^other\.uwb: contains the same exchanges as one\.uwb"):
+        calib.survey(paths)
 
 
 def test_a_curve_is_used_if_powers_do_not_vary():

@@ -80,6 +80,16 @@ def test_failed_exports_leave_no_files(whole, tmp_path):
     assert sorted(path.stem for path in (tmp_path / "there").iterdir()) == sorted(TABLES)
 
 
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("out", [".", "..", "/"])
+def test_a_folder_without_a_name_of_its_own_is_refused_with_an_example(whole, tmp_path, monkeypatch, out, force):
+    (tmp_path / "inside").mkdir()
+    monkeypatch.chdir(tmp_path / "inside")
+    with pytest.raises(RecordingExistsError, match=r"existing folder.*as in .*tables"):
+        export_recording(whole, out, to="csv", force=force)
+    assert [*tmp_path.rglob("*")] == [tmp_path / "inside"]
+
+
 def test_folders_without_an_export_are_not_replaced(whole, tmp_path):
     with pytest.raises(ImportTableError, match=r"contains no exchanges\.csv"):
         import_recording(tmp_path, tmp_path / "o.uwb", importer="exported")

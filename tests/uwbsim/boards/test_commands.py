@@ -212,7 +212,7 @@ def test_no_byte_ends_the_bench_or_another_board():
         data = rng.randbytes(rng.randrange(1, 90)) if kind < RANDOM_SHARE else command(rng)
         victim.write(mangled(rng, data) if kind > 1 - MANGLED_SHARE else data)
         bench.advance(int(bench.env.now) + rng.choice((NS_PER_MS // 10, NS_PER_MS, NS_PER_MS, 2 * NS_PER_MS)))
-        if not (victim.alive and victim.powered):
+        if not (victim.alive and victim.usb.open):
             deaths += 1
             victim.power_cycle()
         if number % 1000 == 999:

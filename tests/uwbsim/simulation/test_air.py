@@ -13,7 +13,7 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.radio import Radio
 from uwbsim.scenario.ranging import after_marker_s, before_marker_s, exchange_air_s, frame_s
 from uwbsim.simulation import air
-from uwbsim.simulation.timestamps import draw, draw_reply_s
+from uwbsim.simulation.timestamps import draw
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 
 US = SUBTICKS_PER_SECOND // 1_000_000
@@ -145,7 +145,7 @@ def with_replies(reply):
 
 
 def test_replies_are_drawn_from_two_modes_a_shoulder_and_a_tail():
-    micro = draw_reply_s(with_replies({"model": "boards"}), stream(1, "reply"), 400_000) * 1e6
+    micro = with_replies({"model": "boards"}).ranging.reply.draw_s(stream(1, "reply"), 400_000) * 1e6
     # 400,000 draws determine a share to 0.0008.
     for below_us, share in ((304.1, 0.207), (305.9, 0.635), (308.3, 0.885), (310.0, 0.9096), (348.25, 0.955)):
         assert np.mean(micro < below_us) == pytest.approx(share, abs=0.003), below_us
@@ -160,7 +160,7 @@ def test_detours_have_the_share_and_the_mean_of_the_scenario_and_noise_is_standa
     assert len(detours) / drawn.excess_m.size == pytest.approx(0.2, abs=0.005)
     assert detours.mean() == pytest.approx(0.5, rel=0.03)
     # Six sequences of 100,000: their covariances are known to 0.003.
-    noise = np.concatenate([drawn.transmit, drawn.receive])
+    noise = np.column_stack([drawn.transmit, drawn.receive]).T
     np.testing.assert_allclose(np.cov(noise), np.eye(6), atol=0.015)
     assert np.abs(noise.mean(axis=1)).max() < 0.015
     quiet = draw(bench(), 100, 3)

@@ -207,10 +207,12 @@ def test_functions_of_a_stranger_reach_other_processes(tmp_path, stranger):
         p = plan(tmp_path, CALIBRATE.replace('["ds"]', '["ss", "mine"]'))
         run_sweep(p, tmp_path / "without", workers=1, evaluate=stranger.figures)
         register_channel_effect("weaker", stranger.weaker)
-        for workers in (1, 2):
-            run_sweep(p, tmp_path / str(workers), workers=workers, evaluate=stranger.figures)
+        try:
+            for workers in (1, 2):
+                run_sweep(p, tmp_path / str(workers), workers=workers, evaluate=stranger.figures)
+        finally:
+            CHANNEL_EFFECTS.remove("weaker")
     finally:
-        CHANNEL_EFFECTS.pop("weaker", None)
         PROTOCOLS.remove("mine")
     assert (tmp_path / "1" / "results.csv").read_bytes() == (tmp_path / "2" / "results.csv").read_bytes()
     counts = {

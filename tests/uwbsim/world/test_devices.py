@@ -250,7 +250,7 @@ def both():
         )
         if not found[1:]:
             uwbsim.register_channel_effect("weaken", weaken_tag)
-    del CHANNEL_EFFECTS["weaken"]
+    CHANNEL_EFFECTS.remove("weaken")
     return found
 
 
@@ -326,9 +326,9 @@ def test_a_body_in_the_way_weakens_served_boards_by_its_chord():
 @pytest.mark.parametrize(
     ("name", "effect", "fragment"),
     [
-        ("shadows", lambda link, _: link, "`name`: found 'shadows', which is taken"),
-        ("x", 3, "`effect`: found 3, expected"),
-        ("", lambda link, _: link, "`name`: found '', expected a word"),
+        ("reflections", lambda link, _: link, "channel effect 'reflections': this name is reserved"),
+        ("x", 3, "channel effect 'x': apply: found 3, expected a function"),
+        ("", lambda link, _: link, "channel effect '': name: found '', expected a word"),
     ],
 )
 def test_wrong_effects_are_refused(name, effect, fragment):
@@ -341,6 +341,7 @@ def test_wrong_effects_are_refused(name, effect, fragment):
     ("effect", "fragment"),
     [
         (lambda link, _: None, "returned None, expected a Link"),
+        (lambda link, _: 1 / 0, "failed with ZeroDivisionError"),
         (lambda link, _: replace(link, power_dbm=-80.0), "power_dbm"),
         (lambda link, _: replace(link, total_dbm=link.total_dbm * np.nan), "total_dbm"),
         (lambda link, _: replace(link, excess_m=link.excess_m[:0]), "excess_m"),
@@ -352,4 +353,4 @@ def test_an_effect_that_returns_no_links_is_named(effect, fragment):
         with pytest.raises(uwbsim.UwbsimError, match=f"channel effect 'strange'.*{fragment}"):
             uwbsim.simulate(reception())
     finally:
-        del CHANNEL_EFFECTS["strange"]
+        CHANNEL_EFFECTS.remove("strange")
