@@ -82,6 +82,6 @@ def test_compare_optimum_and_predict_support_a_new_protocol(row, tmp_path, monke
     assert (said["title"], said["std_m"] > 0) == (row.title, True)
 
 
-def test_schema_and_summary_know_it(row):
+def test_schema_and_summary_contain_the_new_protocol(row):
     assert row.name in json.loads(command("uwbsim", "schema"))["$defs"]["Ranging"]["properties"]["protocol"]["enum"]
     assert row.title in command("uwbsim", "validate", SCENARIO, "--set", f"ranging.protocol={row.name}")

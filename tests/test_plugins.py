@@ -82,7 +82,7 @@ def test_an_effect_of_another_distribution_applies_to_the_flights_of_the_command
 
 
 @pytest.mark.slow
-def test_workers_in_other_processes_know_it_too(run, tmp_path):
+def test_workers_in_other_processes_load_the_plugin(run, tmp_path):
     (tmp_path / "s.toml").write_text(
         '[sweep]\nscenario = "noiseless"\nprotocols = ["strange-ds"]\n'
         "ranges = 1000\nseeds = [1, 2]\n[vary]\n'radio.rx_noise_ps' = [100.0, 200.0]\n"

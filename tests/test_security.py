@@ -160,7 +160,7 @@ def test_scenarios_cannot_read_unnamed_files(place, key, name):
     assert SECRET not in str(caught.value)
 
 
-def test_an_allowed_folder_holds_files_of_scenarios(place):
+def test_scenarios_read_files_of_an_allowed_folder(place):
     (place / "other").mkdir()
     (place / "other" / "slots.csv").write_text("time_s,initiator,target\n0,1,2\n0.1,2,3\n")
     linked(place, "outside")
@@ -258,7 +258,7 @@ def hostile(tmp_path_factory):
 
 
 @pytest.mark.parametrize("line", PRINTING)
-def test_texts_in_files_control_nothing(hostile, line):
+def test_texts_in_files_control_no_terminal_page_or_path(hostile, line):
     ended = run(*line.split(), cwd=hostile)
     assert ended.returncode in (0, 2), ended
     assert all(c.isprintable() or c == "\n" for c in ended.stdout + ended.stderr), ended

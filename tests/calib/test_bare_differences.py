@@ -287,7 +287,7 @@ def test_ranges_and_differences_are_used_together_and_fitted_apart(folder):
     assert found.rmse_m["variance"].mean() < 0.045
 
 
-def test_a_recording_keeps_them(folder):
+def test_a_recording_keeps_bare_differences(folder):
     contents = uwblink.load(folder / "fly/d.uwb")
     for words in ("export fly/d.uwb --to csv -o exported", "import exported exported -o again.uwb"):
         processes.succeed("uwblink", *words.split(), cwd=folder)

@@ -34,7 +34,7 @@ def test_ranges_without_stamps_are_those_of_a_table_without_stamps(tmp_path):
             Exchanges.from_arrays(1, 2, **columns)
 
 
-def test_one_value_stands_for_all_rows_and_floats_of_whole_numbers_will_do():
+def test_one_value_applies_to_all_rows_and_whole_floats_are_accepted():
     floats: Any = {k: np.array(v, dtype=float) for k, v in DS.items()}
     x = Exchanges.from_arrays(1, 2, **floats, protocol="ds-alt")
     assert (x.target.tolist(), x.protocol.tolist(), str(x.tx3.dtype)) == ([2, 2], ["ds-alt"] * 2, "int64")

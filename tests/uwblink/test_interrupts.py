@@ -82,7 +82,7 @@ def flight(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_report_that_is_interrupted_says_so_and_leaves_no_half(flight, tmp_path):
+def test_an_interrupted_report_is_reported_and_leaves_no_partial_file(flight, tmp_path):
     process = started("calib", "report", str(flight), "-o", str(tmp_path / "page.html"))
     wait_for(lambda: is_working(process), process)
     time.sleep(1.0)
@@ -95,7 +95,7 @@ def test_a_report_that_is_interrupted_says_so_and_leaves_no_half(flight, tmp_pat
 
 
 @pytest.mark.slow
-def test_an_import_that_is_interrupted_is_one_line_and_leaves_nothing(tmp_path):
+def test_an_interrupted_import_prints_one_line_and_leaves_no_file(tmp_path):
     row = "{0}.25,{1},9,{2:.3f},-80.5,-81.5\n"
     with (tmp_path / "t.csv").open("w") as file:
         file.write("time_s,from_id,to_id,range_m,fpp1,fpp2\n")
@@ -118,7 +118,7 @@ def test_an_import_that_is_interrupted_is_one_line_and_leaves_nothing(tmp_path):
         (signal.SIGTERM, ("calib", "apply", "../long.uwb", "-c", "../c.json", "-o", "f.uwb")),
     ],
 )
-def test_a_writer_that_is_ended_leaves_nothing(long, tmp_path, words, number):
+def test_a_terminated_writer_leaves_no_file(long, tmp_path, words, number):
     """Interrupted when the first file appears in its folder."""
     folder = long.parent / f"{tmp_path.name}"
     folder.mkdir()

@@ -141,7 +141,7 @@ def test_a_row_without_any_stamp_has_the_range_that_was_reported():
     np.testing.assert_allclose(time_of_flight(e)[0], 7.5 / SPEED_OF_LIGHT, rtol=1e-12)
 
 
-def test_a_stamp_that_is_too_long_says_that_wider_ones_need_bits():
+def test_the_error_for_a_wide_stamp_names_the_option_bits():
     stamps: Any = {"tx1": [2**32], "rx1": [5], "tx2": [1005], "rx2": [3000]}
     with pytest.raises(ArgumentError, match="stamps of 40 bits need bits=40"):
         Exchanges.from_arrays(1, 2, **stamps)

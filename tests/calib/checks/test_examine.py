@@ -174,7 +174,7 @@ UNREAD = "single-sided without carrier readings"
         ),
     ],
 )
-def test_the_fault_is_named_and_nothing_else(plan, plant, fault, told):
+def test_only_the_planted_fault_is_named(plan, plant, fault, told):
     (found,) = calib.examine(plant(fly(plan, 94), RNG(3)))
     assert found.fault == fault
     assert re.search(told, f"{found.evidence}; {found.remedy}")

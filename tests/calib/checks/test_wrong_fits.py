@@ -93,7 +93,7 @@ def test_short_recordings_with_persistent_errors_have_a_warning():
     assert [warning for warning in calib.fit(make(recipe, 1).ranges).warnings if "20 s of data" in warning]
 
 
-def test_intervals_hold_where_errors_last():
+def test_intervals_cover_the_truth_if_errors_persist():
     scores = []
     for seed in range(5):
         world = make(CLEAN["persistent 1 s, 2 cm over 3 s, 90 s"], seed)

@@ -57,7 +57,7 @@ def test_a_file_an_open_recording_and_an_object_are_the_same(path):
     assert_same(both[:900], from_file)
 
 
-def test_every_function_takes_what_a_fit_takes(tmp_path):
+def test_every_function_accepts_the_sources_of_a_fit(tmp_path):
     in_memory = sample_flight(300)
     path = written(tmp_path / "sample.uwb", in_memory, in_memory.meta["planted"])
     from_file = calib.fit([path])
@@ -342,7 +342,7 @@ def test_results_become_frames():
     assert flight.exchanges.to_pandas().range_m.to_numpy() == pytest.approx(flight.exchanges.range_m)
 
 
-def test_without_pandas_one_line_says_what_to_do(monkeypatch):
+def test_without_pandas_the_error_names_the_package_to_install(monkeypatch):
     real = builtins.__import__
 
     def missing(name, *args, **kwargs):

@@ -104,7 +104,7 @@ def test_recordings_are_fitted_together_with_what_each_overheard():
     assert kept.raw_m[kept.arrivals.exchange] == pytest.approx(alone.raw_m[alone.arrivals.exchange])
 
 
-def test_a_listener_that_stands_elsewhere_is_named():
+def test_a_listener_at_a_wrong_place_is_named():
     data, _ = flight(7400)
     heard = data.overheard
     # Tag 9 only listens, at the place of tag 2; its stated position is that, or 10 cm beside it.

@@ -61,7 +61,7 @@ def test_without_constants_of_pairs_the_filter_is_as_accurate(known):
     assert np.mean([one.offsets.mean() for one in own]) < 0.2
 
 
-def test_the_command_says_that_pairs_differ(known, tmp_path):
+def test_the_command_reports_that_pairs_differ(known, tmp_path):
     known.save(tmp_path / "known.json")
     for name, offset_m in (("same", 0.0), ("differs", OFFSET_M)):
         flight(41, 4.0, offset_m=offset_m)[0].save(tmp_path / f"{name}.uwb")

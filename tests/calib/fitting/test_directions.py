@@ -186,7 +186,7 @@ def test_ranges_are_corrected_by_two_directions_or_warn():
         known.correct(3.0, -85.0, -86.0, 1, 2, azimuth_deg=(1.0, 2.0, 3.0))
 
 
-def test_the_file_keeps_patterns_and_older_programs_refuse_it():
+def test_files_keep_patterns_and_older_programs_refuse_them():
     known = fitted(SHORT, 3).calibration
     text = known.to_json()
     assert (calib.Calibration.from_json(text), json.loads(text)["schema_version"]) == (known, 6)
@@ -303,7 +303,7 @@ def test_directions_are_those_in_the_frames_of_the_bodies():
     assert np.isnan(toward[2]).all()
 
 
-def test_places_without_attitudes_tell_no_direction():
+def test_places_without_attitudes_give_no_direction():
     """Bodies without attitudes, as in tables of positions: sigma includes the effect of unknown directions."""
     known, (found, _) = fitted(SHORT, 3).calibration, flown(SHORT, 3, 1)
     when = np.unique(found.poses.time_ns)

@@ -73,7 +73,7 @@ def test_errors_of_undetermined_fits_state_the_reason():
 
 
 @pytest.mark.slow
-def test_the_mixture_knows_delays_better_than_a_loss_does():
+def test_the_mixture_estimates_delays_better_than_a_loss():
     errors: dict[str, list[float]] = {"cauchy": [], "mixture": []}
     for seed in range(4):
         r = ranges(6000, tail=0.3, seed=seed)
@@ -86,7 +86,7 @@ def test_the_mixture_knows_delays_better_than_a_loss_does():
 
 
 @pytest.mark.slow
-def test_the_mixture_s_standard_errors_hold():
+def test_standard_errors_of_the_mixture_match_the_spread():
     scores = []
     for seed in range(16):
         found = calib.fit(ranges(1500, seed=seed), loss="mixture").calibration

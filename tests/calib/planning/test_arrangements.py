@@ -148,7 +148,7 @@ def test_what_cannot_be_planned_is_refused(boards, settings, message):
         calib.plan(boards, **settings)
 
 
-def test_three_in_a_row_say_nothing_where_one_of_their_pairs_is_mostly_reflected():
+def test_three_boards_in_a_row_are_not_used_if_a_pair_is_mostly_reflected():
     """All three pairs are direct with 0.9^3 = 0.73 and 0.7^3 = 0.34; then the middle delay is determined as usual."""
     row = in_orders((1, 2, 3))
     assert predict(given(3, reflected=0.1), row)[0].each[1] == pytest.approx(0.02 * math.sqrt(3) / C_M_PER_NS)
@@ -192,7 +192,7 @@ def test_a_curve_costs_the_information_of_a_process_of_its_size(monkeypatch):
     assert found == pytest.approx(expected, rel=0.1)
 
 
-def test_a_plan_says_what_reflections_and_a_curve_cost():
+def test_a_plan_states_the_accuracy_lost_by_reflections_and_a_curve():
     plain, reflected = (calib.plan(4, on="line", arrangements=4, reflected=share) for share in (0.0, 0.1))
     assert "and 10 % of the pairs are reflected:" in str(reflected)
     assert max(reflected.half_ns.values()) > max(plain.half_ns.values())

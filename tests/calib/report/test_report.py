@@ -114,7 +114,7 @@ def test_the_pdf_has_numbered_pages_an_outline_and_figures_that_are_drawings(cam
     assert all(name in texts[place] for name, place in begin.items())
 
 
-def test_the_json_tells_what_the_page_tells(campaign):
+def test_the_json_contains_the_results_of_the_page(campaign):
     document = json.loads((campaign / "r.json").read_text())
     assert {"calibration", "warnings", "evaluation", "heard", "findings", "localization"} == set(document)
     assert document["evaluation"]["overall"]["full"]["n"] == 960
@@ -141,7 +141,7 @@ def test_tests_take_several_files():
     assert spread_tests(["fit", "a", "-o", "c"]) == ["fit", "a", "-o", "c"]
 
 
-def test_planted_delays_stand_beside_fitted_ones(campaign):
+def test_planted_delays_are_shown_beside_fitted_ones(campaign):
     header, *rows = page_of_numpy.Tables((campaign / "r.html").read_text()).having("planted, same gauge (ns)")
     with Recording.open(campaign / "train.uwb") as recording:
         planted = recording.meta()["planted"]["delays_ns"]

@@ -152,7 +152,7 @@ def test_the_general_shape_applies_to_arrangements_without_one(tmp_path):
 
 
 @pytest.mark.parametrize("shape", ["", "line"])
-def test_one_pair_determines_nothing(shape):
+def test_one_pair_determines_no_delay(shape):
     ranges = standing_boards(1, boards=2, arrangements=4).ranges
     for count in (1, 4):
         spans = {str(k): (70.0 * k, 70.0 * k + 60) for k in range(count)}
@@ -376,7 +376,7 @@ def surveyed(recording):
     return calib.survey(recording)
 
 
-def test_the_command_takes_a_recording_per_arrangement(recording, tmp_path):
+def test_the_command_accepts_a_recording_per_arrangement(recording, tmp_path):
     out, anchors = tmp_path / "c.json", tmp_path / "anchors.toml"
     words = ["survey", *recording, "-o", out, "--save-anchors", f"B={anchors}", "--json"]
     told = json.loads(processes.succeed("calib", *words).stdout)

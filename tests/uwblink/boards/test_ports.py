@@ -48,7 +48,7 @@ def test_permission_denied_names_the_group(tmp_path):
     assert f"join the group {(tmp_path / 'port').group()}" in str(error)
 
 
-def test_a_second_opening_is_refused_and_a_lost_port_says_so():
+def test_a_port_opens_once_and_a_lost_port_is_an_error():
     with served() as server:
         port = SerialPort(server.names[1])
         with pytest.raises(PortBusyError, match="another process"):

@@ -129,7 +129,7 @@ start(command)
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="on one core linear algebra has one thread anyway")
 @pytest.mark.parametrize(("asked", "threads"), [(None, "1"), ("2", "2")])
-def test_linear_algebra_takes_one_thread_unless_asked_for_more(asked, threads):
+def test_linear_algebra_uses_one_thread_by_default(asked, threads):
     environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
     if asked:
         environment |= {"OPENBLAS_NUM_THREADS": asked, "MKL_NUM_THREADS": asked}

@@ -39,7 +39,7 @@ def in_order(path):
 
 
 @pytest.mark.parametrize("form", [pytest.param("csv", marks=pytest.mark.slow), "parquet"])
-def test_every_column_of_every_table_comes_back(whole, tmp_path, form):
+def test_every_column_of_every_table_is_imported_again(whole, tmp_path, form):
     folder = tmp_path / "it's; DROP TABLE x"
     counts = export_recording(whole, folder, to=form)
     expected = in_order(whole)
@@ -277,7 +277,7 @@ def test_every_message_is_there_in_order_of_time(recording, tmp_path):
         ("rosbag2", 5, 1e39, 1.0, r"r\.uwb: /uwb/range_1_2: has a number that is .*too large"),
     ],
 )
-def test_values_that_messages_cannot_hold_are_one_line(tmp_path, to, time_ns, range_m, x, said):
+def test_values_that_do_not_fit_messages_are_an_error_of_one_line(tmp_path, to, time_ns, range_m, x, said):
     sample = Exchanges.from_arrays([1], [2], time_ns=[time_ns], range_m=[range_m], tx1=[0], rx1=[5], tx2=[9], rx2=[30])
     poses = Poses(np.array([9]), np.array(["drone"]), np.array([[x, 1.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))
     Contents(exchanges=sample, poses=poses).save(tmp_path / "r.uwb")

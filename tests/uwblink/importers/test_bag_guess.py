@@ -324,7 +324,7 @@ def test_messages_without_ranges_are_one_line(tmp_path, text):
         by_map(tmp_path, bag, '[topics."/a/{b"]\n[constants]\nfrom_id = 7\nto_id = 8\nrange_m = 3\n')
 
 
-def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
+def test_without_the_extra_the_error_names_the_package_to_install(tmp_path, monkeypatch):
     bag = ros2(tmp_path / "b", RANGES)
     monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
     with pytest.raises(ImportTableError, match=r"pip install 'uwbcal\[bags\]'"):

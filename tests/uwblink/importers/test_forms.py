@@ -451,7 +451,7 @@ def test_positions_have_units(tmp_path):
     assert (set(found.initiator), set(found.truth_m)) == ({7}, {2.5})
 
 
-def test_a_table_without_a_header_says_so(tmp_path):
+def test_a_table_without_a_header_is_refused_with_that_reason(tmp_path):
     with pytest.raises(ImportTableError, match=r"its first line is a row.* from_id = 2"):
         imported(tmp_path, "".join(f"{k},1,2,{3 + k / 7:.3f}\n" for k in range(30)))
 

@@ -74,7 +74,7 @@ def test_a_map_of_a_line_without_an_end_is_refused_soon(tmp_path):
     processes.refuse("uwblink", "import", "guess", tmp_path / "t.csv", naming=["t.csv: row 2"], timeout=90)
 
 
-def test_a_long_line_takes_no_memory(tmp_path):
+def test_a_long_line_is_not_read_into_memory(tmp_path):
     """256 MB in one line, of which only a few lines' worth is read."""
     with gzip.open(tmp_path / "t.csv.gz", "wb", compresslevel=1) as file:
         file.write(HEAD.encode())
@@ -160,7 +160,7 @@ def test_errors_name_the_given_file(tmp_path):
         IMPORTERS.remove("flux")
 
 
-def test_an_interrupted_import_leaves_nothing(tmp_path):
+def test_an_interrupted_import_of_a_hard_table_leaves_no_file(tmp_path):
     """Ctrl-C at any time: a file with the name is complete, and there are no other files."""
     source = write(tmp_path / "t.csv", wrapped(flights(300)))
     stages = []
@@ -226,7 +226,7 @@ def test_a_long_table_is_the_same_a_few_rows_at_a_time(tmp_path, monkeypatch, la
 
 
 @pytest.mark.parametrize("layout", ["messages", "stamps", "parts"])
-def test_a_table_without_any_device_says_so(tmp_path, layout):
+def test_a_table_without_any_device_is_refused_with_that_reason(tmp_path, layout):
     lines = [line | {"from_id": "", "message": 1} for line in lines_of(layout)]
     with pytest.raises(ImportTableError, match="row 2, column 'from_id'"):
         read_rows(tmp_path, lines, f'layout = "{layout}"\n[columns]\nsequence = "seq"\n')

@@ -103,7 +103,7 @@ def truths(e):
     return [np.linalg.norm(antenna(i) - antenna(j)) for i, j in zip(e.initiator, e.target, strict=True)]
 
 
-def test_every_stamp_of_a_flight_comes_back_once(flight, tmp_path):
+def test_every_stamp_of_a_flight_is_imported_once(flight, tmp_path):
     folder, made, own = flight
     found = imported(folder, tmp_path)
     e, heard, meta = found.exchanges, found.overheard, found.meta

@@ -229,7 +229,7 @@ def test_colours_of_series_are_distinct(eyes, ground):
 
 
 @pytest.mark.parametrize("ground", ["light", "dark"])
-def test_lines_and_words_of_figures_stand_out(ground):
+def test_lines_and_text_of_figures_have_contrast(ground):
     # The last two must not stand out, and still show.
     asked = dict.fromkeys(SERIES, 3.0) | {INK: 4.5, MUTED: 4.5, GRID: 1.3, PALE: 1.8}
     for colour, least in asked.items():
@@ -237,7 +237,7 @@ def test_lines_and_words_of_figures_stand_out(ground):
 
 
 @pytest.mark.parametrize("ground", ["light", "dark"])
-def test_words_of_pages_stand_out(ground):
+def test_text_of_pages_has_contrast(ground):
     light, dark = CSS[: CSS.index("* {")].split("@media screen and (prefers-color-scheme: dark)")
     colours = dict(re.findall(r"(--[a-z-]+):\s*(#[0-9a-f]{3,6})", light if ground == "light" else dark))
     full = {name: c if len(c) == 7 else "#" + "".join(2 * x for x in c[1:]) for name, c in colours.items()}

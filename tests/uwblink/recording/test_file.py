@@ -62,7 +62,7 @@ def test_an_existing_file_is_not_replaced_without_force(recording):
     assert len(load(recording).exchanges) == 0
 
 
-def test_a_failed_block_leaves_nothing_behind(tmp_path):
+def test_a_failed_block_leaves_no_file(tmp_path):
     with pytest.raises(RuntimeError, match="midway"), Recording.create(tmp_path / "x.uwb") as r:
         r.append_exchanges(random_exchanges())
         raise RuntimeError("midway")

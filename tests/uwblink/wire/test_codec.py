@@ -93,13 +93,13 @@ def test_ranges_recomputed_from_every_captured_exchange():
         np.testing.assert_array_equal(board_range(exchanges), exchanges.range_m)
 
 
-def test_a_cir_comes_in_many_pieces():
+def test_a_cir_is_decoded_from_many_pieces():
     cir = m.Cir(1, 2, 747_015, tuple(range(1016)))
     assert encode(cir).startswith(b"S10|1|2|747|15|0|1|2|")
     assert decode(encode(cir), m.REPORTS, [300] * 15) == [cir]
 
 
-def test_after_damage_every_intact_message_comes_back():
+def test_after_damage_every_intact_message_is_decoded():
     whole = next(d for d in REPORTED if d.startswith(b"R05"))
     (expected,) = decode(whole, m.REPORTS)
     for place in range(len(whole)):
@@ -157,7 +157,7 @@ def test_any_bytes_in_any_chunks_are_messages_or_counted_skips(table, data, size
 
 
 @given(st.binary(max_size=92))
-def test_any_broadcast_comes_back(data):
+def test_any_broadcast_is_decoded_as_encoded(data):
     for table, kind in ((m.COMMANDS, m.Broadcast), (m.REPORTS, m.BroadcastReceived)):
         assert decode(encode(kind(data)), table) == [kind(data)]
 

@@ -326,13 +326,13 @@ def scenario(stays=((0.2, 0.1),), places=3):
     return uwbsim.load({"run": {"duration_s": 9.0}, "ranging": {"rate_hz": 20.0}, "bodies": bodies, "tags": tags})
 
 
-def test_boards_stand_while_nobody_is_carried():
+def test_boards_stand_still_while_no_body_is_carried():
     found = stays_s(scenario(((10.0, 2.0), (5.0, 4.0)), places=2))
     assert (found, stays_s(scenario(()))) == ([(0.0, 5.0), (9.0, 10.0), (12.0, math.inf)], [])
     assert stays_s(scenario(((10.0, 2.0),), places=1)) == [(0.0, math.inf)]
 
 
-def test_a_server_says_when_boards_stand():
+def test_a_server_prints_when_boards_stand_still():
     told: list[str] = []
     with closing(uwbsim.Server(scenario())) as server:
         server.announce(told.append)

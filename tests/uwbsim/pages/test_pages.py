@@ -204,7 +204,7 @@ def test_numbers_along_an_axis_do_not_cover_each_other(x):
         assert all(left.x1 + 2 < right.x0 for left, right in pairwise(one))
 
 
-def test_warnings_stand_below_the_table_of_pairs():
+def test_warnings_are_below_the_table_of_pairs():
     warned = [line.startswith("warning:") for line in str(uwbsim.preview("nlos_office/office")).splitlines()]
     assert any(warned)
     assert warned == sorted(warned)

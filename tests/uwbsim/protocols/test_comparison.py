@@ -40,7 +40,7 @@ def test_predictions_agree_with_simulations(scenario):
         assert len(samples[o.protocol]) == 200_000
 
 
-def test_an_exchange_takes_what_its_frames_and_replies_take(scenario):
+def test_the_duration_of_an_exchange_is_the_sum_of_frames_and_replies(scenario):
     ss, ds, sym = (costs(scenario, PROTOCOLS[name], 1e-3) for name in ("ss", "ds", "ds-sym"))
     # A second round adds the boards' immediate reply; the symmetric one a whole scheduled reply.
     assert ds["duration_s"] - ss["duration_s"] == pytest.approx(305e-6, abs=1e-9)

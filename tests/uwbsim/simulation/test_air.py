@@ -130,7 +130,7 @@ def test_exchanges_start_when_they_should(hosts, between_us):
     assert (outcome.lost[1], np.diff(outcome.start)[0] / US) == (-1, pytest.approx(between_us, abs=2))
 
 
-def test_progress_is_told_for_every_500th_slot_as_a_share_of_all_hosts():
+def test_progress_is_reported_every_500_slots_as_a_share_of_all_hosts():
     told: list[float] = []
     hosts = [[slot(k, 3000 * k, 0, 1) for k in range(501)], [slot(501, 0, 4, 5)]]
     powers = np.full((8, 8), -120.0)

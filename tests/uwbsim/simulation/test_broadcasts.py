@@ -132,7 +132,7 @@ def test_frames_that_overlap_are_lost_as_powers_and_times_say():
     assert found.faults[0].detail.endswith(("frame collision", "frame receiver busy"))
 
 
-def test_who_is_out_of_range_hears_nothing_and_ranges_with_nobody():
+def test_boards_out_of_range_receive_no_frames_and_have_no_ranges():
     far = uwbsim.simulate(world(places=PLACES | {4: (900.0, 0.0, 0.0)}))
     r = table(far)
     assert 4 not in [*r.sender, *r.listener]

@@ -85,7 +85,7 @@ def test_alike_requires_a_detectable_difference(compared):
     assert one.verdict == "too few"
 
 
-def test_robots_warm_up_and_it_is_seen(compared):
+def test_warm_up_of_robots_is_found(compared):
     """Clocks of flying robots change by up to 4 ppm in the first 40 s; those of anchors hardly do."""
     twin = compared[0]
     assert twin.found["warm_up_s"] is not None

@@ -166,7 +166,7 @@ def still_flight(radio, second=None, duration_s=400.0, **ranging):
     )
 
 
-def test_fading_has_the_spread_and_the_life_that_were_asked_for():
+def test_fading_has_the_set_spread_and_lifetime():
     x = still_flight({"fading": {"std_db": 2.0, "life_s": 0.1}}).exchanges
     # 4000 draws: the standard error of the spread is 1.1 %, that of an autocorrelation 0.02.
     assert np.std(x.fpp1_dbm) == pytest.approx(2.0, rel=0.05)
@@ -417,7 +417,7 @@ def test_the_workbench_counts_them_as_errors():
     assert found.pooled()[0] == pytest.approx(np.mean(raw_range(flight.exchanges) - flight.truth_m), abs=0.002)
 
 
-def test_pairs_shares_and_lives_spread_as_asked_for():
+def test_shares_and_lifetimes_of_pairs_have_the_set_spread():
     tags = [{"id": k, "body": "ab"[k % 2], "lever_arm_m": [0.1 * k, 0, 0]} for k in range(40)]
     bodies = [{"name": n, "motion": {"model": "static", "position_m": PLACES[n]}} for n in "ab"]
     model = MODEL | {"share": 0.2, "share_std": 0.1, "life_s": 0.05}

@@ -68,7 +68,7 @@ def test_noise_depends_neither_on_what_else_is_asked_nor_on_how_long_the_run_is(
     np.testing.assert_array_equal(whole, long.read(tag, time))
 
 
-def test_noisy_clocks_begin_at_their_offset_and_never_stand_still():
+def test_noisy_clocks_begin_at_their_offset_and_always_change():
     c = clocks(clock_offset_s=1.0, **NOISY)
     np.testing.assert_array_equal(c.read(BOTH, np.zeros(2, dtype=np.int64)), c.offset)
     assert (c.offset // SUBTICKS).tolist() == [63_897_600_000] * 2
@@ -83,7 +83,7 @@ def test_drawn_offsets_are_any_reading_of_the_counter_and_any_part_of_a_tick():
     assert len(np.unique(parts)) > 50
 
 
-def test_the_noises_of_two_clocks_have_nothing_to_do_with_each_other():
+def test_the_noises_of_two_clocks_are_independent():
     c, time = clocks(100.0, white_ppm_sqrt_s=0.01, flicker_ppm=0.01), subticks(np.arange(0, 100, 0.001))
     # 100,000 independent pairs determine a correlation to 0.003.
     assert abs(np.corrcoef(*(np.diff(ahead_s(c, time, k)) for k in (0, 1)))[0, 1]) < 0.015
@@ -247,7 +247,7 @@ def test_a_body_at_rest_feels_what_holds_it_up_and_errs_by_its_grade():
     assert np.std(np.diff(force, axis=0)) / np.sqrt(2) == pytest.approx(0.5, rel=0.03)
 
 
-def test_biases_differ_between_seeds_and_are_as_large_as_said():
+def test_biases_differ_between_seeds_and_have_the_set_size():
     imu = {"accel_bias_mps2": 0.2, "rate_hz": 50}
     means = [columns(flown(STILL, 1.0, seed, imu=imu).imu, "a").mean(axis=0) for seed in range(30)]
     assert np.std(np.subtract(means, (0, 0, 9.81))) == pytest.approx(0.2, rel=0.25)

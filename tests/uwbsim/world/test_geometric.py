@@ -108,7 +108,7 @@ def test_the_reflection_off_the_floor_has_fresnels_loss_and_the_antennas_gains()
         assert abs(turned - expected) < 0.025 * abs(expected)
 
 
-def test_an_upright_dipole_sees_a_metal_wall_turn_its_field_round():
+def test_a_metal_wall_inverts_the_field_of_an_upright_dipole():
     walls = ROOM | {"material": "metal", "floor": {"loss_db_per_m": 0}, "ceiling": {"loss_db_per_m": 0}}
     length, amplitude = world_paths(scenario(places=(A, (5.0, 3.5, 1.0)), room=walls, radio={"antenna": "dipole"}))
     length = length - np.linalg.norm(np.subtract(A, B)) + np.hypot(4.0, 1.5)
@@ -143,7 +143,7 @@ def test_a_blocked_link_ranges_by_the_reflection_and_shows_it_in_its_powers():
     np.testing.assert_allclose(raw_range(flight.exchanges) - flight.truth_m, found.excess_m[0], atol=0.006)
 
 
-def test_bodies_stand_in_each_others_way_and_in_their_own():
+def test_bodies_block_paths_of_others_and_their_own():
     shadow = {"semi_axes_m": [0.3, 0.3, 0.3], "loss_db_per_m": 60.0}
     post = {"name": "post", "motion": {"model": "static", "position_m": [3.0, 2.75, 1.3]}, "shadow": shadow}
     free, shaded = (link(scenario(bodies=bodies)) for bodies in ([], [post]))
@@ -217,7 +217,7 @@ def test_scatterers_stay_where_they_are_and_more_of_them_leave_the_first_there()
     assert np.all((many.place_m >= 0) & (many.place_m <= np.array([8.0, 6.0, 3.0])))
 
 
-def test_what_is_asked_one_at_a_time_and_all_at_once_is_the_same_draw_for_draw():
+def test_links_computed_singly_and_together_have_the_same_draws():
     """While a tag moves: flights ask for many links, served boards for one sender at a time."""
     world = World(scenario(places=(A, B, (6.5, 1.0, 0.8)), motion=SLOW, **CLUTTER))
     time = (np.linspace(0.0, 0.9, 37) * SUBTICKS_PER_SECOND).astype(np.int64)
@@ -341,7 +341,7 @@ def test_a_long_thin_wall_is_a_knife_edge(above_m):
         assert -20 * np.log10(abs(1 - cover[0, 0])) == pytest.approx(itu_db(nu), abs=1.0)
 
 
-def test_boxes_that_are_not_between_the_ends_do_nothing():
+def test_boxes_beside_the_path_have_no_effect():
     box = Obstacle(min_m=(6, -1, -1), max_m=(7, 1, 1), material="metal")
     a, b = np.zeros((2, 3)), np.array([[5.0, 0, 0], [-5.0, 0, 0]])
     assert np.all(boxes_blocked([box], a, b)[0] == 0)
@@ -374,7 +374,7 @@ def test_a_tall_body_is_a_wall_with_two_edges():
     assert loss == pytest.approx(itu_db(nu) - 20 * np.log10(2), abs=0.2), "two fields of as much each"
 
 
-def test_through_a_body_goes_what_its_loss_leaves():
+def test_a_body_attenuates_a_path_by_its_loss():
     mild = Shadow(semi_axes_m=(0.3, 0.3, 0.3), loss_db_per_m=10.0)
     ends = np.array([[-2.0, 0, 0]]), np.array([[3.0, 0, 0]])
     past = 10 ** (-past_db(0.0) / 20)
@@ -408,14 +408,14 @@ def test_reflection_loss_of_materials_straight_on(name, loss_db):
     assert -20 * np.log10(abs(s[0])) == pytest.approx(loss_db, abs=0.1)
 
 
-def test_a_lossy_material_loses_what_it_says():
+def test_a_lossy_material_has_its_stated_loss():
     """A wave exp(-j k n z) through a metre of it."""
     n = np.sqrt(permittivity(Material(loss_db_per_m=80.0, index=2.4)))
     assert -20 * np.log10(abs(np.exp(-2j * np.pi / WAVELENGTH_M * n))) == pytest.approx(80.0, rel=1e-9)
     assert n.real == pytest.approx(2.4)
 
 
-def test_roughness_takes_what_rayleigh_says():
+def test_roughness_reduces_reflections_as_rayleigh_states():
     """Path differences of 2 h cos(theta) spread phases by 4 pi h cos(theta)/wavelength, averaged over a Gaussian."""
     rng = np.random.default_rng(1)
     for cosine in (1.0, 0.5):
