@@ -1,4 +1,4 @@
-"""Boards to test with: a scenario of three on a bench, served in a thread, and real ones where there are any."""
+"""Boards for tests: a scenario of three on a bench, served in a thread, and real ones if there are any."""
 
 import os
 import threading
@@ -28,14 +28,14 @@ def bench_scenario(seed=1, **radio):
 
 
 def record_bench(path, plan=None, ports=None, **more):
-    """Record the boards of the bench in virtual time, at 50 exchanges a second unless a plan says otherwise."""
+    """Record the boards of the bench in virtual time, at 50 exchanges per second unless a plan states another rate."""
     ports = ports or VirtualPorts(bench_scenario())
     return record(ports.names.values(), path, plan or RangingPlan(rate_hz=50.0), using=ports, **more)
 
 
 @contextmanager
 def served(scenario=None, faults=None, link_dir=None, **more):
-    """Serve a scenario in a thread; gives the server."""
+    """Serve a scenario in a thread; yield the server."""
     wrong = FaultsFile.model_validate({"faults": faults or []})
     server = Server(scenario or bench_scenario(), link_dir, wrong, **more)
     stop = threading.Event()
@@ -45,15 +45,15 @@ def served(scenario=None, faults=None, link_dir=None, **more):
         yield server
     finally:
         stop.set()
-        thread.join(60)  # a step takes long where the machine is busy, and what it writes to must not be closed
+        thread.join(60)  # under load, a step takes long, and its output must not be closed
         server.close()
 
 
 @contextmanager
 def two_ports(kind):
-    """Give the ports of two boards: "virtual" in process, "terminal" served, or "real", of which UWB_PORTS names two.
+    """Yield the ports of two boards: "virtual" in process, "terminal" served, or "real", of which UWB_PORTS names two.
 
-    Gives the bench of the boards, too, where they are ours.
+    Also yield the bench of the boards, None for real ones.
     """
     if kind == "virtual":
         ports = VirtualPorts(bench_scenario())

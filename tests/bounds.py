@@ -1,6 +1,6 @@
-"""The dependencies at the ends of their bounds: `python -m tests.bounds lowest|newest` prints what pip should install.
+"""Dependencies at the ends of their ranges: `python -m tests.bounds lowest|newest` prints requirements for pip.
 
-`lowest` are the versions that pyproject.toml names as the first ones that will do, `newest` whatever is newest.
+`lowest` are the lowest versions in pyproject.toml, `newest` the newest versions.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final
 
 PROJECT: Final = Path(__file__).parents[1] / "pyproject.toml"
 STYLE: Final = ("mypy", "ruff", "scipy-stubs", "furo", "myst-nb", "myst-parser", "sphinx")
-"""What looks at code or makes pages of it, and runs no test: names begin so."""
+"""Start of names of tools that check code or make pages, and run no test."""
 
 
 def requirements() -> list[str]:
@@ -26,7 +26,7 @@ def requirements() -> list[str]:
 
 
 def lowest(requirement: str) -> str:
-    """Return the requirement of exactly its lowest version; raises `ValueError` for one without."""
+    """Return the requirement of exactly the lowest version; raises `ValueError` if there is none."""
     found = re.fullmatch(r"(?P<name>[A-Za-z0-9_.-]+)(\[[a-z,]+\])?>=(?P<lowest>[0-9][0-9.]*)", requirement)
     if found is None:
         raise ValueError(f"{PROJECT.name}: {requirement!r} names no lowest version (name>=1.2)")

@@ -1,4 +1,4 @@
-"""A browser for tests of pages: pictures of them, and what they measure."""
+"""A browser for tests of pages: screenshots, and measurements of pages."""
 
 import json
 import re
@@ -20,7 +20,7 @@ const drawn = [...document.querySelectorAll('figure svg')].filter(e => e.getClie
 parent.postMessage(JSON.stringify({inner: innerWidth, page: document.documentElement.scrollWidth,
   wide: wide.map(t => t.replace(/[<>&]/g, ' ')), text: Math.min(...text), drawn: Math.min(...drawn, 99)}), '*');
 </script></body>"""
-# In a frame: a window of its own is never narrower than 500 pixels.
+# In a frame, because a window is never narrower than 500 pixels.
 FRAME = """<!doctype html><body><iframe src="{name}" style="width:{width}px;height:2000px;border:0"></iframe><script>
 onmessage = event => {{ const told = document.createElement('output'); told.textContent = event.data;
   document.body.replaceChildren(told); }};
@@ -28,7 +28,7 @@ onmessage = event => {{ const told = document.createElement('output'); told.text
 
 
 def chromium(*arguments, profile):
-    """Run Chromium; skips where none is installed."""
+    """Run Chromium; skips if it is not installed."""
     program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if not program:
         pytest.skip("no Chromium is installed to render the page with")
@@ -37,7 +37,9 @@ def chromium(*arguments, profile):
 
 
 def measured(page, width, folder):
-    """Return how a page of HTML (text) lies in a window of a width: pixels of window, page, and the smallest texts."""
+    """Return widths of window and page in pixels, and the smallest texts, for an HTML page (text) in a window of a
+    width.
+    """
     path, frame = folder / f"measured-{width}.html", folder / f"frame-{width}.html"
     path.write_text(page.replace("</body>", MEASURE))
     frame.write_text(FRAME.format(name=path.name, width=width))
@@ -49,7 +51,7 @@ def measured(page, width, folder):
 
 
 def lies_well(page, width, folder):
-    """Assert that nothing runs out of a window, and that all text can be read."""
+    """Assert that nothing exceeds the window, and that all text is large enough."""
     found = measured(page, width, folder)
     assert found["inner"] == width
     assert found["page"] <= width, found["wide"][:5]

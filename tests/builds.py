@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def built(folder: Path, *, of: Path = ROOT) -> list[Path]:
-    """Build wheel and sdist of a tree into a folder; returns both, the wheel first."""
+    """Build wheel and sdist of a tree into a folder; return both, the wheel first."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "1577836800")
     subprocess.run(
         [sys.executable, "-m", "hatchling", "build", "-d", folder, "-t", "sdist", "-t", "wheel"],

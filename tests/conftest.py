@@ -1,10 +1,10 @@
-"""The order of files: the longest first, so that two cores end at the same time. And what hypothesis may take."""
+"""The order of test files, the longest first, so that two cores end at the same time; and settings of hypothesis."""
 
 from typing import Final
 
 from hypothesis import settings
 
-settings.register_profile("no clock", deadline=None)  # on a busy machine an example takes long
+settings.register_profile("no clock", deadline=None)  # under load, an example takes long
 settings.load_profile("no clock")
 
 LONGEST: Final = (

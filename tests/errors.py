@@ -1,4 +1,4 @@
-"""What errors must say."""
+"""Patterns of error messages."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Imported last by the server of forks: its memory is left alone by collections, so that forks go on sharing it."""
+"""Imported last by the fork server: garbage collection then leaves its memory unchanged, so that forks share it."""
 
 import gc
 

@@ -1,7 +1,8 @@
-"""What pip users meet: the wheel in an empty environment, and the README's commands there, without a checkout.
+"""The installation of a pip user: the wheel in an empty environment, and the commands of the README, without a
+checkout.
 
-`python -m tests.installed [FOLDER]` builds the wheel and installs it with its dependencies as pip chooses them.
-It prints what each step took, and how large the environment is.
+`python -m tests.installed [FOLDER]` builds the wheel and installs it with the dependencies that pip chooses. It prints
+the time of each step, and the size of the environment.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ FIRST: Final = (
     "calib fit sample.uwb -o sample.json",
     "uwbsim schema",
 )
-"""What must go before anything is copied."""
+"""Folders that are not copied."""
 
 
 def readme_commands() -> list[str]:
@@ -40,9 +41,9 @@ def readme_commands() -> list[str]:
 
 
 def timed(what: str, command: list[str], cwd: Path, path: str) -> None:
-    """Run a command, and print what it took; raises `SystemExit` with what it said where it fails."""
+    """Run a command, and print its time; raises `SystemExit` with its output if it fails."""
     begun = time.monotonic()
-    # Nothing of a checkout may be found by way of the environment.
+    # The environment must not lead to a checkout.
     clean = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
     done = subprocess.run(command, cwd=cwd, env=clean | {"PATH": path}, capture_output=True, text=True)
     if done.returncode:
@@ -51,12 +52,12 @@ def timed(what: str, command: list[str], cwd: Path, path: str) -> None:
 
 
 def size_mb(folder: Path) -> float:
-    """Return what the files below a folder take."""
+    """Return the size of the files in a folder."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file() and not path.is_symlink()) / 1e6
 
 
 def main(folder: Path) -> int:
-    """Build, install, and run everything in a folder."""
+    """Build, install, and run all commands in a folder."""
     wheel, _ = built(folder / "dist")
     environment, work = folder / "env", folder / "work"
     work.mkdir()

@@ -1,6 +1,6 @@
-"""The licences of everything that is installed: `python -m tests.licences` writes them into docs/licences.md.
+"""The licences of all installed packages: `python -m tests.licences` writes them into docs/licences.md.
 
-Names are those of requirements-dev.lock; licences are what the installed distributions say of themselves.
+Names are those of requirements-dev.lock; licences are stated by the installed distributions.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ PERMISSIVE: Final = frozenset(
     {"0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "BSD", "CC0-1.0", "ISC", "MIT", "MIT-0", "MIT-CMU", "HPND"}
     | {"any-OSI", "PSF-2.0", "Python-2.0", "Unlicense", "Zlib", "MPL-2.0"}
 )
-"""What may be installed beside a program under the MIT licence without a condition on that program."""
+"""Licences of packages that can be installed with a program under the MIT licence without conditions for it."""
 
 LINKED: Final = frozenset({"LGPL-3.0", "LGPL-3.0-only", "LGPL-3.0-or-later"})
-"""What may be imported, unchanged and replaceable, by a program under another licence."""
+"""Licences of packages that may be imported, unchanged and replaceable, by a program under another licence."""
 
 JUDGED: Final = {
     "docutils": "its GPL is that of a mode for Emacs, which its wheel does not contain",
 }
-"""Distributions whose statement needs a look, and what the look found."""
+"""Distributions with unclear statements, and the licences found by hand."""
 
 SPELT: Final = {
     "mit license": "MIT",
@@ -57,16 +57,16 @@ SPELT: Final = {
     "gnu lesser general public license": "LGPL-3.0",
     "lgplv3+": "LGPL-3.0-or-later",
 }
-"""Names that distributions gave licences before there was one spelling."""
+"""Other names of licences, from the time before SPDX identifiers."""
 
 
 def names_of(lock: str) -> list[str]:
-    """Return the names in a lock, each once, in order."""
+    """Return the names in a lock file, each once, in order."""
     return sorted({canonicalize_name(name) for name in re.findall(r"^([\w.-]+)==", lock, flags=re.MULTILINE)})
 
 
 def licence_of(name: str) -> str:
-    """Return the licence of a distribution as an SPDX expression, or what it says itself where that is none."""
+    """Return the licence of a distribution as an SPDX expression, or its own statement if that is not one."""
     try:
         told = distribution(name).metadata
     except PackageNotFoundError:
@@ -79,7 +79,7 @@ def licence_of(name: str) -> str:
 
 
 def installed_with(requirements: list[str]) -> set[str]:
-    """Return the names of distributions that are installed with some, themselves included."""
+    """Return the names of distributions that are installed with some distributions, including these."""
     waiting = list(map(Requirement, requirements))
     known: set[str] = set()
     while waiting:
@@ -93,7 +93,7 @@ def installed_with(requirements: list[str]) -> set[str]:
 
 
 def rows() -> list[tuple[str, str, str]]:
-    """Return name, licence and what it is for, of everything in the lock that is installed here."""
+    """Return name, licence and purpose of all packages in the lock file that are installed here."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     plain = installed_with(project["dependencies"])
     extra = {name: installed_with(listed) - plain for name, listed in project["optional-dependencies"].items()}
@@ -110,11 +110,11 @@ ELSEWHERE: Final = {
     "colorama": "BSD-3-Clause",
     "pycparser": "BSD-3-Clause",
 }
-"""Licences of what is installed on other systems alone, as their projects state them."""
+"""Licences of packages for other systems, as their projects state them."""
 
 
 def table(found: list[tuple[str, str, str]]) -> str:
-    """Return the rows as a table in Markdown: a line for each licence and way to be installed."""
+    """Return the rows as a table in Markdown: a line for each licence and purpose."""
     notes = {name: f" ({told})" for name, told in JUDGED.items()}
     groups: dict[tuple[str, str], list[str]] = {}
     for name, licence, purpose in found:
@@ -131,7 +131,7 @@ def allowed(name: str, licence: str) -> bool:
 
 
 def main() -> int:
-    """Write the table into the page; says what may not stand there, and returns 1 then."""
+    """Write the table into the page; print incompatible licences, and return 1 if there are any."""
     found = rows()
     text = PAGE.read_text(encoding="utf-8")
     before, after = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]

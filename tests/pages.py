@@ -1,8 +1,8 @@
-"""Code blocks of the documentation's pages, and how each kind is run.
+"""Code blocks of the documentation pages, and how each kind is run.
 
-A block is run unless a comment before it says why not: `<!-- not run: REASON -->`, or `<!-- run by: FILE -->` where a
-test of its own runs it. What a page's commands and Python print is held against the block of text behind them, numbers
-aside: those of simulations move by a last digit with versions of libraries. A line `...` stands for any lines.
+A block is run unless a comment before it gives a reason: `<!-- not run: REASON -->`, or `<!-- run by: FILE -->` if its
+own test runs it. The output of commands and Python is compared with the block of text after them, without numbers,
+because versions of libraries change last digits of simulations. A line `...` stands for any lines.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FENCE: Final = re.compile(
 NUMBER: Final = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")
 COMMANDS: Final = ("uwbsim", "uwblink", "calib")
 DRAWING: Final = "drawing"
-"""What a block without a language is."""
+"""Label of a block without a language."""
 
 CALLED: Final = re.compile(r"^(uwbsim|uwblink|calib|python) +[a-z-]", flags=re.M)
 LEFT: Final = "..."
@@ -41,7 +41,7 @@ LEFT: Final = "..."
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A block of code: language, label, text, the line it begins at, and why it is not run, if so."""
+    """A block of code: language, label, text, its first line, and the reason if it is not run."""
 
     language: str
     label: str
@@ -52,13 +52,13 @@ class Block:
 
 
 def pages() -> list[Path]:
-    """Return the pages that people write."""
+    """Return the pages that are not generated."""
     found = (path for path in DOCS.rglob("*.md") if not {"_build", "generated"} & set(path.relative_to(DOCS).parts))
     return sorted(found)
 
 
 def blocks(path: Path) -> list[Block]:
-    """Return the blocks of code of a page; directives of the site are none."""
+    """Return the blocks of code of a page, without directives of the site."""
     text = path.read_text(encoding="utf-8")
     return [
         Block(
@@ -76,13 +76,13 @@ def blocks(path: Path) -> list[Block]:
 
 @dataclass
 class Runner:
-    """Runs the blocks of one page one after the other, in the working folder; Python shares its names."""
+    """Runs the blocks of one page in order, in the working folder; Python blocks share their names."""
 
     names: dict[str, Any] = field(default_factory=lambda: {"__name__": "__page__"})
     printed: str = ""
 
     def run(self, block: Block) -> None:
-        """Run a block, or hold what was printed against it; raises `AssertionError` that says what is wrong."""
+        """Run a block, or compare output with it; raises `AssertionError` with the difference."""
         if block.language == "sh":
             self.printed = "".join(command(line) for line in lines(block.code))
         elif block.language == "python":
@@ -103,7 +103,7 @@ class Runner:
 
 
 def lines(code: str) -> Iterator[str]:
-    """Yield the commands of a block, without comments; flights are of 12 s at most, comparisons of 2000 ranges."""
+    """Yield the commands of a block, without comments; flights have at most 12 s, comparisons 2000 ranges."""
     for most, number in ((12, r"(run\.duration_s=|plan flight .*--duration )(\d+)"), (2000, r"(compare .* -n )(\d+)")):
         code = re.sub(number, lambda found: f"{found[1]}{min(most, int(found[2]))}", code)  # noqa: B023 - called at once
     for line in code.replace("\\\n", " ").splitlines():
@@ -113,7 +113,7 @@ def lines(code: str) -> Iterator[str]:
 
 
 def command(line: str) -> str:
-    """Run a command of the project in this process; returns what it printed, which `> FILE` writes instead."""
+    """Run a command of the project in this process; return its output, which `> FILE` writes to a file instead."""
     bare, _, output = line.partition(" > ")
     words = shlex.split(bare)
     assert words[0] in COMMANDS, f"{line}: only {', '.join(COMMANDS)} are run"
@@ -132,13 +132,13 @@ def command(line: str) -> str:
 
 @contextlib.contextmanager
 def told() -> Iterator[io.StringIO]:
-    """Catch what is printed, as it would be on a terminal of 100 columns."""
+    """Capture output, as on a terminal of 100 columns."""
     with patch.dict(os.environ, COLUMNS="100"), contextlib.redirect_stdout(io.StringIO()) as printed:
         yield printed
 
 
 def compare(printed: str, shown: str) -> None:
-    """Raise `AssertionError` where the page shows words that were not printed in that order."""
+    """Raise `AssertionError` if the page shows words that were not printed in that order."""
     left = masked(printed)
     for part in filter(str.strip, shown.split(f"{LEFT}\n")):
         wanted = masked(part)
@@ -147,13 +147,13 @@ def compare(printed: str, shown: str) -> None:
 
 
 def masked(text: str) -> str:
-    """Return words with numbers as #: rules of tables and padding aside."""
+    """Return words with # in place of numbers, without rules of tables and padding."""
     bare = NUMBER.sub("#", text)
     return " ".join(word for word in re.sub(r"[─━]+", "", bare).split())
 
 
 def outline(draw: figures.Draw, width_in: float, kinds: Iterable[str], salt: str = "") -> dict[str, bytes]:
-    """Make a figure without setting and rendering it, in place of `uwblink.pages.figures.drawn`."""
+    """Draw a figure without layout and rendering, in place of `uwblink.pages.figures.drawn`."""
     with figures.style():
         draw(width_in)
     return dict.fromkeys(kinds, b"<svg/>")

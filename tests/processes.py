@@ -1,6 +1,6 @@
-"""Runs `uwblink`, `uwbsim` and `calib`: in the process of the tests, or forked from one that has imported everything.
+"""Run `uwblink`, `uwbsim` and `calib` in the process of the tests, or in a fork of one that has imported everything.
 
-A command takes 0.4 s to import what it needs and often less to do its work, and the suite calls hundreds.
+A command takes 0.4 s for its imports and often less for its work, and the tests run hundreds.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ CONTEXT.set_forkserver_preload(
 
 
 def run(*words: object, cwd: str | os.PathLike[str] | None = None, **how: Any) -> subprocess.CompletedProcess[str]:
-    """Run a command as `subprocess.run` does with captured text, its first word the name of the command.
+    """Run a command like `subprocess.run` with captured text; its first word is the name of the command.
 
-    It runs in this process, unless `how` says what `fork` can do for it.
+    It runs in this process unless `how` has arguments of `fork`.
     """
     if how:
         return fork(*words, cwd=cwd, **how)
@@ -66,11 +66,11 @@ def fork(
     limits: Mapping[int, int] | None = None,
     user: int | None = None,
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command as `run` does, in a process of its own.
+    """Run a command like `run`, in a separate process.
 
-    `env` is the whole environment; of what is set there for the time of importing only PYTHONPATH has an effect. No
-    file that the command writes may be longer than `most_bytes`, as on a full disk; `limits` are others of `resource`.
-    `user` takes its rights away.
+    `env` is the whole environment; of variables that act during imports, only PYTHONPATH has an effect. No file that
+    the command writes may be longer than `most_bytes`, as on a full disk; `limits` are other limits of `resource`.
+    `user` removes the rights of root.
     """
     argv = [str(BIN / str(words[0])), *map(str, words[1:])]
     limits = dict(limits or {}) | ({} if most_bytes is None else {resource.RLIMIT_FSIZE: most_bytes})
@@ -95,7 +95,7 @@ def succeed(*words: object, **how: Any) -> subprocess.CompletedProcess[str]:
 
 
 def refuse(*words: object, naming: Iterable[object] = (), status: int = 2, **how: Any) -> str:
-    """Run a command that must print nothing but one line of error, which has every text of `naming`; returns it."""
+    """Run a command that must print only one line of error, which contains every text of `naming`; return the line."""
     ended = run(*words, **how)
     assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (status, "", 1), ended
     assert ended.stderr.startswith("error: "), ended
@@ -107,14 +107,14 @@ def refuse(*words: object, naming: Iterable[object] = (), status: int = 2, **how
 def _work(
     argv: list[str], printed: list[str], cwd: str, env: dict[str, str], limits: dict[int, int], user: int | None
 ) -> None:
-    """Become a command: its folder, environment, output and limits; ends the process with its status."""
+    """Become a command: its folder, environment, output and limits; end the process with its status."""
     for descriptor, path in enumerate([os.devnull, *printed]):
         opened = os.open(path, os.O_CREAT | os.O_WRONLY if descriptor else os.O_RDONLY, 0o600)
         os.dup2(opened, descriptor)
         os.close(opened)
     sys.stdin = open(0, encoding="utf-8", closefd=False)  # noqa: SIM115 - it is the process's own
     if resource.RLIMIT_FSIZE in limits:
-        # Python would keep a compiled module that it could write in part only. Text is kept until the limit is lifted.
+        # Python would keep a compiled module that it could write only partly. Text is kept until the limit is removed.
         sys.dont_write_bytecode = True
         sys.stdout, sys.stderr = io.StringIO(), io.StringIO()
     os.chdir(cwd)
@@ -130,7 +130,7 @@ def _work(
     except BaseException:
         traceback.print_exc()
     finally:
-        # A measurement of coverage writes its own file at exit, on a disk that has room.
+        # Coverage writes its own file at exit, on a disk with space.
         _limit(dict.fromkeys(limits, resource.RLIM_INFINITY))
         atexit._run_exitfuncs()
         for descriptor, stream in enumerate((sys.stdout, sys.stderr), 1):
@@ -141,14 +141,14 @@ def _work(
 
 
 def _limit(limits: Mapping[int, int]) -> None:
-    """Set limits of this process, which it may lift again up to those that it had."""
+    """Set limits of this process, which it may raise again to the previous ones."""
     for kind, most in limits.items():
         hard = resource.getrlimit(kind)[1]
         resource.setrlimit(kind, (hard if most == resource.RLIM_INFINITY else most, hard))
 
 
 def _call(argv: list[str]) -> int:
-    """Call a command as its script does: it is the main module, of no package."""
+    """Call a command as its script does: it is the main module, without a package."""
     sys.argv = argv
     own: Any = sys.modules["__main__"]
     own.__package__, own.__spec__, own.__file__ = "", None, argv[0]

@@ -1,4 +1,4 @@
-"""The rooms of the packages as their imports say: who imports whom, and on which floor that puts each.
+"""The rooms of the packages by their imports, and the layer of each room.
 
 `python -m tests.rooms` (`make rooms`) prints them.
 """
@@ -20,7 +20,7 @@ Rooms = dict[str, set[str]]
 
 @cache
 def imports(source: str) -> frozenset[str]:
-    """Return the dotted names that a module imports, those under `if TYPE_CHECKING` among them."""
+    """Return the dotted names that a module imports, including those under `if TYPE_CHECKING`."""
     found: set[str] = set()
     for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Import):
@@ -31,12 +31,12 @@ def imports(source: str) -> frozenset[str]:
 
 
 def room_of(path: Path, package: Path) -> str:
-    """Return the room of a file: its folder in the package, or itself where it stands in none."""
+    """Return the room of a file: its folder in the package, or the module itself if it is in none."""
     return path.relative_to(package).parts[0].removesuffix(".py")
 
 
 def rooms(package: str, root: Path = ROOT) -> Rooms:
-    """Return every room of a package and the other rooms that it imports; the front door is none."""
+    """Return every room of a package and the other rooms that it imports; the front door is left out."""
     folder = root / package
     names = {room_of(path, folder) for path in folder.rglob("*.py")} - {"__init__", "__main__"}
     found: Rooms = {name: set() for name in names}
@@ -50,9 +50,9 @@ def rooms(package: str, root: Path = ROOT) -> Rooms:
 
 
 def floors(graph: Rooms) -> list[list[str]]:
-    """Return the rooms by floor, the ground first: each stands one above the highest that it imports.
+    """Return the rooms by layer, the lowest first: each is one above the highest that it imports.
 
-    Raises `graphlib.CycleError` for rooms that import each other in a circle.
+    Raises `graphlib.CycleError` if rooms import each other in a circle.
     """
     found, sorter = [], TopologicalSorter(graph)
     sorter.prepare()
@@ -63,7 +63,7 @@ def floors(graph: Rooms) -> list[list[str]]:
 
 
 def drawing(root: Path = ROOT) -> str:
-    """Return the picture: from the top floor down, each room with the rooms below it that it imports."""
+    """Return a text from the top layer down: each room with the rooms below it that it imports."""
     lines = []
     for package in PACKAGES:
         graph = rooms(package, root)

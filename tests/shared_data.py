@@ -1,4 +1,4 @@
-"""Recordings that live beside the checkout, not in it; tests that use them skip, and say so, where they are absent."""
+"""Recordings beside the checkout; tests that use them skip with a message if they are absent."""
 
 import os
 import tarfile
@@ -20,9 +20,9 @@ def shared(name):
 
 
 def rows_of(name, ending):
-    """Return the rows, by their headers, of all tables of an archive whose names end so."""
+    """Return the rows, by their headers, of all tables of an archive whose names have a given end."""
     with tarfile.open(shared(name)) as archive:
-        # In the order of the archive, which is decompressed once then.
+        # In the order of the archive, which is then decompressed once.
         return [
             row
             for member in archive
@@ -32,7 +32,7 @@ def rows_of(name, ending):
 
 
 def miluv(folder):
-    """Unpack MILUV's flight among obstacles into a folder; returns where it is."""
+    """Unpack MILUV's flight among obstacles into a folder; return its path."""
     with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
         archive.extractall(folder, filter="data")
     return folder / "cirObstacles_3_random_0"

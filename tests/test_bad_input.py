@@ -1,4 +1,4 @@
-"""Mistakes that a user or a stranger's file can make at the commands: one line, the right status, nothing written.
+"""Mistakes of users and faulty files, with all commands: one line, the right status, no output.
 
 `{name}` in a line is a file of the fixture `seeds`; `own.*` is a file with the text of the row, in the working folder.
 """
@@ -39,7 +39,7 @@ PUBLISHED = {"delays_ns": {"1": 0.1, "2": 1e12}, "bias_spline_m": CURVE, "std_sp
 
 
 def changed(path, poses=None, tags=None, rows=slice(None), anchors=False, **columns):
-    """Save the small flight that `calib sample` makes, with other columns of its exchanges, poses or tags."""
+    """Save the small flight of `calib sample` with other columns of its exchanges, poses or tags."""
     flight = calib.sample_flight(COUNT, anchors=anchors)
     exchanges = replace(flight.exchanges, **columns)[rows]
     poses, tags = flight.poses if poses is None else poses, flight.tags if tags is None else tags
@@ -74,7 +74,7 @@ def listed(folder):
 
 
 def refused(seeds, folder, line, naming, text="", status=2, **names):
-    """Run a line in a folder in which nothing may change but the row's own file, which is written before."""
+    """Run a line in a folder in which nothing may change except the row's own file, which is written before."""
     names |= {path.name.replace(".", "_"): path for path in seeds.iterdir()} | {"here": folder, "long": "a" * 5000}
     words = [word.format(**names, bench=BENCH, no=NO_UTF8) if "{" in word else word for word in line.split()]
     for name in ("mine", "mine.html", "mine.pdf"):
@@ -148,7 +148,7 @@ WORDS = [
     ("calib report no.uwb -o r.html", ["no.uwb", "no such"]),
     ("calib export {c_json} --to csv -o no/out.csv", ["no"]),
     ("uwblink import csv {t_csv_gz} -o o.uwb", ["t.csv.gz", "gzip"]),
-    # A recording that is given twice, under another name, too, would count as twice the evidence.
+    # A recording that is given twice, also under another name, would count as twice the evidence.
     ("calib fit {f_uwb} {f_uwb} -o o.json", ["f.uwb"]),
     ("calib evaluate {again_uwb} {f_uwb} -c {c_json}", ["f.uwb"]),
     # A recording is not written under the name of a table.
@@ -158,7 +158,7 @@ WORDS = [
     ("uwblink import csv {r_csv} -o c.csv", ["c.csv", "c.uwb"]),
     *((f"uwbsim predict --protocol {name} --final-delay-us 500", [name, "--final-delay"]) for name in
       ("ds-sym", "ss", "ss-cfo")),
-    # Names of files that are no UTF-8, which the system takes and DuckDB does not.
+    # Names of files that are not UTF-8, which the system accepts and DuckDB does not.
     *((line, [r"no\udcff", "must be UTF-8"]) for line in (
         "uwblink show {here}/../{no}.uwb",
         "uwbsim run noiseless -o new{no}.uwb",
@@ -167,7 +167,7 @@ WORDS = [
         "uwbsim compare noiseless -o {no} -n 200 --protocols ds",
     )),
     ("uwblink send /dev/nothing {no}", ["/dev/nothing: no such port"]),
-    # What is no recording.
+    # Files that are not recordings.
     *((line.format(name, c="{c_json}"), [named, fragment])
       for name, named, fragment in (("no.uwb", "no.uwb", "no such"), ("{cut_uwb}", "cut.uwb", "truncated"),
                                     ("{other_uwb}", "other.uwb", "not a"), ("{here}", "", "directory"))
@@ -192,7 +192,7 @@ WORDS = [
         "uwbsim sweep {p_toml} -o o",
     )),
     ("uwbsim run noiseless -o o.uwb --set run.seed=" + "[" * 3000, ["run.seed"]),
-    # Boards that are not there.
+    # Boards that do not exist.
     *((f"uwblink {words}", ["/dev/nothing", "no such port"]) for words in (
         "info /dev/nothing", "twr /dev/nothing 2", "test /dev/nothing", "set-delay /dev/nothing 1500",
         "passive /dev/nothing on", "send /dev/nothing x", "cir /dev/nothing 2",
@@ -257,7 +257,7 @@ OWN = [
 
 
 @pytest.mark.parametrize(("line", "naming", "text"), [*((line, naming, "") for line, naming in WORDS), *OWN])
-def test_what_cannot_be_is_named_and_nothing_is_written(seeds, tmp_path, line, naming, text):
+def test_mistakes_are_named_and_nothing_is_written(seeds, tmp_path, line, naming, text):
     line = line.replace("{here}/../", f"{seeds}/")
     refused(seeds, tmp_path, line, naming, text)
 
@@ -293,7 +293,7 @@ def ports():
         ("info {silent}", ["b'C07\\r'", "heard nothing", "check that this is a ranging board"]),
     ],
 )
-def test_what_a_board_or_a_recorder_cannot_do(seeds, ports, tmp_path, line, naming):
+def test_mistakes_with_boards_and_recorders_are_named(seeds, ports, tmp_path, line, naming):
     silent = Terminal()
     names = {"one": ports[1], "two": ports[2], "silent": silent.name}
     refused(seeds, tmp_path, f"uwblink {line}", naming, "pairs = [[1, 9]]", **names)
@@ -363,7 +363,7 @@ def test_served_poses_do_not_replace_an_input(tmp_path):
         assert (tmp_path / "scenario").read_text() == BENCH.read_text()
 
 
-def test_a_server_says_how_to_record_and_a_recording_is_replayed_as_it_was(tmp_path, ports):
+def test_the_command_printed_by_a_server_records_and_replay_repeats_it(tmp_path, ports):
     said = succeed("uwbsim", "serve", BENCH, "--link-dir", tmp_path / "ports", "--duration", 0.1)
     assert said.stdout.startswith("tag  10  ")
     assert f"uwblink record {tmp_path / 'ports'}/* --pairs all -o flight.uwb" in said.stderr
@@ -392,7 +392,7 @@ def test_no_fifo_or_device_is_replaced(seeds, tmp_path, line):
 
 
 def test_a_folder_with_something_else_in_it_is_not_replaced(seeds, tmp_path):
-    """`--force` of an export deletes what was exported before, and nothing else."""
+    """`--force` of an export deletes an earlier export, and nothing else."""
     export = "uwblink export {f_uwb} --to csv --force -o out"
     for _ in range(2):
         succeed(*export.format(f_uwb=seeds / "f.uwb").split(), cwd=tmp_path)
@@ -434,7 +434,7 @@ FIT = "calib fit {here}/bad.uwb -o c.json"
         ),
     ],
 )
-def test_what_a_recording_cannot_answer_is_status_1(seeds, tmp_path, change, line, naming):
+def test_undetermined_results_have_status_1(seeds, tmp_path, change, line, naming):
     changed(tmp_path / "bad.uwb", **change)
     refused(seeds, tmp_path, line, naming, status=1)
 
@@ -469,7 +469,7 @@ def test_poses_of_a_part_of_the_flight_are_enough_for_a_warning(tmp_path):
         ("uncertainty/bias_m2", [[1.0]]),
     ],
 )
-def test_numbers_that_no_calibration_can_have_are_refused_and_named(seeds, path, value):
+def test_impossible_numbers_in_calibrations_are_refused(seeds, path, value):
     text = (seeds / "c.json").read_text()
     table = inner = json.loads(text)
     *outer, last = path.split("/")
@@ -505,7 +505,7 @@ def test_delays_without_standard_errors_are_not_taken_for_exact(seeds, tmp_path)
         assert told in run(*line, cwd=tmp_path).stdout
 
 
-def test_what_needs_no_powers_works_without_any(tmp_path):
+def test_commands_without_powers_work(tmp_path):
     path = changed(tmp_path / "f.uwb", anchors=True, **nothing("fpp1_dbm", "fpp2_dbm"))
     (finding,) = calib.examine(path)
     assert (finding.fault, finding.evidence) == ("no powers", "0 % of the exchanges have a first-path power")
@@ -535,11 +535,11 @@ def test_a_twin_does_without_exchanges_of_a_tag_with_itself(tmp_path):
     calib.fit(flight).save(tmp_path / "k.json")
     with_itself, whole = (uwbsim.twin(data, tmp_path / "k.json").found for data in (mixed, flight))
     assert with_itself["exchanges"] == whole["exchanges"] - len(target[::50])
-    # Two in a hundred fewer say the same to a few per cent.
+    # Two fewer in a hundred give the same to a few per cent.
     assert with_itself["receive_noise_ps"] == pytest.approx(whole["receive_noise_ps"], rel=0.1)
 
 
-def test_delays_of_all_tags_and_no_curve_blame_the_calibration(seeds):
+def test_fits_of_known_delays_without_a_curve_are_refused(seeds):
     for known, said in (
         ({"delays_from": seeds / "c.json"}, "`delays_from`: it has the delays of all tags"),
         ({"fixed_ns": {1: 0.0, 2: 0.0, 3: 0.0}}, "`fixed_ns`: all delays are known"),
@@ -553,13 +553,13 @@ def test_a_recording_is_no_table_to_guess_at(seeds):
         guess_map(seeds / "f.uwb")
 
 
-def test_nothing_is_something_to_begin_with():
+def test_empty_recordings_can_be_written_and_read():
     assert (len(Poses.from_arrays([], [], [])), len(Poses.from_arrays([], "drone", np.zeros((0, 3))))) == (0, 0)
     assert len(Exchanges.from_arrays([], [], tx1=[], rx1=[], tx2=[], rx2=[])) == 0
 
 
 def test_evaluating_ranges_of_the_first_calibrated_tags_only():
-    """A simulation plants delays of tags that do not range in the part that is evaluated."""
+    """A simulation plants delays of tags that do not range in the evaluated part."""
     flight = calib.sample_flight(anchors=True)
     known = calib.fit(flight).calibration
     planted = {"knots": [0.0] * 4 + [2.0] * 4, "coefficients": [0.0, 0.01, 0.02, 0.03], "degree": 3}

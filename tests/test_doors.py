@@ -1,4 +1,4 @@
-"""What packages offer and import: doors that are complete and cheap, rooms in layers, and every name once."""
+"""Offers and imports of the packages: complete and cheap front doors, rooms in layers, and every name once."""
 
 import ast
 import doctest
@@ -16,7 +16,7 @@ from tests.rooms import PACKAGES, ROOT, floors, imports, parsed, rooms
 
 HEAVY = ("numpy", "scipy", "duckdb", "matplotlib", "pydantic", "simpy", "typer", "rich", "serial")
 
-# What commands use beside doors, each with its reason.
+# Modules that commands use in addition to front doors, each with its reason.
 BESIDE = {
     "uwblink.exporters.export_recording": "the front door offers no export yet",
     "uwblink.importers.guess.guess_map": "what import suggests where no map is given; read_source takes the map",
@@ -31,7 +31,7 @@ BESIDE = {
 
 
 def modules(package):
-    """Return the modules right below a package or a room, by name, and whether each is a folder."""
+    """Return the modules directly in a package or a room, by name, and whether each is a folder."""
     return {found.name: found.ispkg for found in pkgutil.iter_modules(importlib.import_module(package).__path__)}
 
 
@@ -40,12 +40,12 @@ ROOMS = set().union(*DOORS.values())
 
 
 def offered(module):
-    """Return what a front door or the door of a room (a module of the first level with `__all__`) offers."""
+    """Return the names that a front door or the door of a room (a module of the first level with `__all__`) offers."""
     return set(getattr(importlib.import_module(module), "__all__", ()))
 
 
 def used(source):
-    """Yield module and name of everything that a module takes from the three packages; "" for a module itself."""
+    """Yield module and name of all imports of a module from the three packages; "" for a module itself."""
     for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Import):
             yield from ((alias.name, "") for alias in node.names if alias.name.split(".")[0] in PACKAGES)
@@ -93,13 +93,13 @@ def test_commands_go_through_doors(package):
         ("calib", "import calib\nfrom uwblink.cli import shared\nfrom calib.errors import CalibError\ncalib.fit", []),
     ],
 )
-def test_the_walk_sees_a_back_door(package, source, found):
+def test_the_check_finds_a_back_door(package, source, found):
     assert strangers(package, source) == found
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_what_doors_offer_is_there_once_and_by_no_name_of_a_module(package):
-    """Importing a module of such a name, from anywhere, would put it in the place of what the door offers."""
+def test_offered_names_are_unique_and_no_modules(package):
+    """Importing a module of such a name, from anywhere, would replace the offered object."""
     for door in [package, *(f"{package}.{name}" for name in modules(package) if name != "__main__")]:
         module = importlib.import_module(door)
         names = list(getattr(module, "__all__", ()))
@@ -110,21 +110,21 @@ def test_what_doors_offer_is_there_once_and_by_no_name_of_a_module(package):
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_what_dir_shows_is_what_is_offered(package):
+def test_dir_shows_the_offered_names(package):
     module = importlib.import_module(package)
     assert sorted(dir(module)) == sorted(offered(package))
     with pytest.raises(AttributeError, match=f"module '{package}' has no attribute 'nothing'"):
         _ = module.nothing
 
 
-# Values have no docstring, and a scenario's is the description in the JSON Schema: `load` shows one.
+# Values have no docstring, and that of a scenario is the description in the JSON Schema: `load` shows one.
 WITHOUT = {("uwblink", "PROTOCOLS"), ("uwblink", "SPEED_OF_LIGHT"), ("uwbsim", "Scenario")}
 SHOWN = {(package, name) for package in PACKAGES for name in offered(package) if not name.endswith("Error")} - WITHOUT
 
 
 @pytest.mark.parametrize(("package", "name"), sorted(SHOWN))
 def test_everything_but_errors_has_an_example_that_runs(package, name, tmp_path, monkeypatch):
-    """Those of calib take seconds, and tests/calib runs them; of uwbsim those of classes run, not of their methods."""
+    """Examples of calib take seconds, and tests/calib runs them; of uwbsim, those of classes run, not of methods."""
     monkeypatch.chdir(tmp_path)
     thing = getattr(importlib.import_module(package), name)
     module = sys.modules.get(getattr(thing, "__module__", None) or package)
@@ -145,11 +145,11 @@ def test_the_example_at_the_head_of_a_package_runs_and_importing_it_loads_nothin
     assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split() == []
 
 
-# One word means one thing: the names of public classes and of constants, in all packages together.
+# One word means one thing: names of public classes and constants, in all packages together.
 
 
 def defined(source):
-    """Yield the names of public classes and constants that a module defines, those in tuples included."""
+    """Yield the names of public classes and constants that a module defines, including those in tuples."""
     for node in parsed(source).body:
         if isinstance(node, ast.ClassDef):
             yield node.name
@@ -167,11 +167,11 @@ def twice(sources):
     return {name: paths for name, paths in found.items() if len(paths) > 1 and not name.startswith("_")}
 
 
-def test_no_two_modules_give_one_name_to_a_class_or_a_constant():
+def test_names_of_classes_and_constants_are_unique():
     assert twice({path: path.read_text() for package in PACKAGES for path in (ROOT / package).rglob("*.py")}) == {}
 
 
-def test_a_name_of_two_things_is_seen():
+def test_the_check_finds_repeated_names():
     sources = {
         "uwblink/a.py": "class Track: ...\nclass _Own: ...\nLEAST, MOST = 1, 2",
         "calib/b.py": "class Track: ...\nclass _Own: ...\nMOST: Final = 5\nTABLE[LEAST] = 1",
@@ -179,12 +179,13 @@ def test_a_name_of_two_things_is_seen():
     assert twice(sources) == {"Track": [*sources], "MOST": [*sources]}
 
 
-# What stands in one place only: constants and the robust spread.
+# Objects with one definition: constants and the robust spread.
 
 
 FILES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 
-# Numbers that every formula takes from one module: in air, in a vacuum, and what makes a median deviation a sigma.
+# Numbers that every formula takes from one module: the speed of light in air and in vacuum, and the factor of median
+# deviations.
 HOMES = {
     299_702_547.0: "uwblink/ticks.py",
     299_792_458.0: "calib/checks/columns.py",
@@ -201,7 +202,7 @@ def test_constants_are_written_once():
     assert sorted((number, path.relative_to(ROOT).as_posix()) for number, path in found) == sorted(HOMES.items())
 
 
-# The import rule of docs/architecture.md, held by walking every import statement.
+# The import rule of docs/architecture.md, tested with every import statement.
 
 
 FORBIDDEN = {
@@ -209,7 +210,7 @@ FORBIDDEN = {
     "uwbsim": {"calib"},
     "calib": {"uwbsim"},
 }
-# A library that belongs to certain files only.
+# Libraries that only certain files may import.
 CONFINED = {
     "serial": lambda path: path == "uwblink/boards/ports.py",
     "simpy": lambda path: path.startswith("uwbsim/"),
@@ -244,7 +245,7 @@ NEVER = {"pickle", "pyarrow"}
 
 def violations(package: str, path: str, source: str) -> list[str]:
     names = {name.split(".")[0] for name in imports(source)}
-    # A twin reads a calibration through calib's door.
+    # A twin reads a calibration through the front door of calib.
     forbidden = FORBIDDEN[package] - ({"calib"} if path == "uwbsim/twins/range_errors.py" else set())
     wrong = names & (forbidden | NEVER)
     wrong |= {lib for lib, allowed in CONFINED.items() if lib in names and not allowed(path)}
@@ -271,7 +272,7 @@ def test_package_keeps_the_import_rule(package):
         ("uwblink", "uwblink/x.py", "import pickle"),
     ],
 )
-def test_the_walk_sees_a_violation(package, path, source):
+def test_the_check_finds_a_violation_of_the_import_rule(package, path, source):
     assert violations(package, path, source)
 
 
@@ -280,7 +281,7 @@ def test_no_rooms_import_each_other_in_a_circle(package):
     assert floors(rooms(package))
 
 
-def test_a_circle_is_seen(tmp_path):
+def test_the_check_finds_a_circle(tmp_path):
     sources = {
         "__init__": "from calib.fits.x import a",
         "errors": "",

@@ -1,7 +1,7 @@
-"""A full disk under every command that writes: one line, status 2, and no half file.
+"""A full disk with every command that writes: one line, status 2, and no partial file.
 
-The disk is full in that no file may grow beyond some length, which the system itself enforces. A command or an output
-that is new must get a line here.
+The disk is full in that no file may exceed some length, which the system enforces. A new command or output needs a row
+here.
 """
 
 import importlib
@@ -38,7 +38,7 @@ def flight(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def seeds(flight):
-    """The same folder with all that the commands of the table take."""
+    """The same folder with all inputs of the commands in the table."""
     flown = uwblink.load(flight / "f.uwb")
     calib.fit(flown).calibration.save(flight / "c.json")
     x = flown.exchanges
@@ -55,7 +55,7 @@ def seeds(flight):
 
 
 COMMANDS = (
-    # A log that cannot grow, a file that cannot be completed at the end, and one that cannot even be begun.
+    # A log that cannot grow, a file that cannot be completed at the end, and one that cannot be created.
     ("uwbsim run {s.toml} -o out.uwb", 40_000),
     ("uwbsim run {s.toml} -o out.uwb", 300_000),
     ("uwbsim run {s.toml} -o out.uwb", 4_000),
@@ -98,7 +98,7 @@ COMMANDS = (
 SAME = {
     "uwbsim compare --figures": "calib compare --figures",
     "uwbsim sweep --figures": "calib compare --figures",
-    # One function writes what is drawn (uwblink.pages.blocks), and drawing takes seconds.
+    # One function writes all figures (uwblink.pages.blocks), and drawing takes seconds.
     "calib localize --figures": "calib compare --figures",
     "calib evaluate --figures": "calib compare --figures",
     "calib evaluate --report": "calib plan survey --output",
@@ -110,10 +110,10 @@ SAME = {
     "calib plan flight --output": "calib plan survey --output",
     "calib plan survey --figures": "calib compare --figures",
     "calib plan flight --figures": "calib compare --figures",
-    # The same function imports whatever form a source has.
+    # The same function imports all forms of a source.
     "uwblink import miluv --output": "uwblink import csv --output",
 }
-"""Outputs that are written by the very function that another line of the table has."""
+"""Outputs written by the same function as another row of the table."""
 
 ELSEWHERE = {
     "uwblink record --output": "uwblink/boards/test_recorder.py",
@@ -121,18 +121,18 @@ ELSEWHERE = {
     "uwbsim sweep --output": "uwbsim/sweep/test_machine_faults.py",
     "uwblink cir --plot": "test_full_disk.py",
 }
-"""Outputs that other tests write onto a full disk: the sweep keeps what it has done, the recorder what it recorded."""
+"""Outputs with a full disk in other tests: the sweep keeps finished runs, the recorder its recorded rows."""
 
 
 def is_path(parameter):
-    """Whether an option takes a path, as this typer says it, or an older one."""
+    """Return whether an option takes a path, for this and for older versions of typer."""
     if hasattr(parameter, "type_descriptor"):
         return parameter.type_descriptor.annotation is Path
     return parameter.type.name == "path"
 
 
 def outputs():
-    """Return every output that commands have, as `calib fit --output`."""
+    """Return every output of commands, such as `calib fit --output`."""
     found = set()
     for package in ("uwblink", "uwbsim", "calib"):
         app = importlib.import_module(f"{package}.cli.commands").app
@@ -143,7 +143,7 @@ def outputs():
 
 
 def of_line(line):
-    """Return the output that a line of the table writes."""
+    """Return the output that a row of the table writes."""
     words = line.split()
     flag = next(word for word in reversed(words) if word in ("-o", "--tum", "--figures"))
     named = words[: 3 if words[1] in ("import", "plan") else 2]
@@ -170,7 +170,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(seeds, tmp_path, line, most_
 
 
 @pytest.mark.parametrize("room", [0, 20_000])
-def test_poses_for_which_the_disk_has_no_room_or_room_in_the_log_alone(flight, tmp_path, room):
+def test_poses_on_a_full_disk_are_refused(flight, tmp_path, room):
     path = tmp_path / "f.uwb"
     flown = uwblink.load(flight / "f.uwb")
     replace(flown, poses=flown.poses[:0]).save(path)
@@ -178,7 +178,7 @@ def test_poses_for_which_the_disk_has_no_room_or_room_in_the_log_alone(flight, t
     most_bytes = path.stat().st_size + room if room else 1000
     naming = ["everything before is kept", "keep the two together"] if room else ["cannot be written"]
     refuse("uwblink", "poses", path, *source, cwd=tmp_path, most_bytes=most_bytes, naming=naming)
-    # DuckDB's log of an update that failed may lie beside it, too, until the recording is next written to.
+    # The log of DuckDB of a failed update may remain, too, until the recording is written again.
     names = {each.name for each in tmp_path.iterdir()}
     assert {"f.uwb", *(["f.uwb.wal"] if room else [])} <= names <= {"f.uwb", "f.uwb.wal"}
     after, bodies = uwblink.load(path), {"ifo001", "ifo002"} if room else set()
@@ -189,7 +189,7 @@ def test_poses_for_which_the_disk_has_no_room_or_room_in_the_log_alone(flight, t
     ("most_bytes", "said"), [(4_000, "cannot be written ("), (900_000, "cannot be written any more (")]
 )
 def test_a_stream_for_which_the_disk_has_no_room(tmp_path, most_bytes, said):
-    """It is full when the recording begins, or when all has been written to the log and is put into the file."""
+    """The disk is full at the start of the recording, or when the whole log is merged into the file."""
     with served() as server:
         words = ["uwblink", "stream", *server.names.values(), "-o", "out.uwb", "--duration", "1.5", "--rate", "100"]
         ended = run(*words, cwd=tmp_path, most_bytes=most_bytes)
@@ -198,7 +198,7 @@ def test_a_stream_for_which_the_disk_has_no_room(tmp_path, most_bytes, said):
         assert list(tmp_path.iterdir()) == []
         return
     assert (tmp_path / "out.uwb").stat().st_size == most_bytes
-    # On a busy machine there are few, and an answer that came too late is in the file alone.
+    # Under load there are few, and an answer that came too late is only in the file.
     assert len(uwblink.load(tmp_path / "out.uwb").exchanges) >= len(ended.stdout.splitlines()) > 0
 
 

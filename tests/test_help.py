@@ -1,4 +1,4 @@
-"""Help as people see it in a terminal of 80 columns: whole texts, panels, examples that parse, completion, speed."""
+"""Help on a terminal of 80 columns: complete texts, panels, examples that parse, completion, speed."""
 
 import json
 import os
@@ -57,7 +57,7 @@ def test_help_fits_80_columns_loses_no_word_and_has_examples_that_parse(words, c
     for told in [command.help, *(getattr(p, "help", None) for p in command.params)]:
         assert Text.from_markup(told or "").plain == (told or "").replace("\\[", "["), "brackets that are markup"
         assert [word for word in words_of(told or "") if word not in seen] == [], told
-    # Brackets are no markup, and a flag takes no value.
+    # Brackets are not markup, and flags take no value.
     assert [wrong for wrong in ("\\[", "<bool>") if wrong in text] == []
     if len(words) == 2:
         assert isinstance(command.rich_help_panel, str), "commands stand in panels"
@@ -86,7 +86,7 @@ def test_help_fits_80_columns_loses_no_word_and_has_examples_that_parse(words, c
         ("uwbsim nonsense", "uwbsim: no such command 'nonsense'; see 'uwbsim --help'"),
     ],
 )
-def test_wrong_words_are_answered_in_one_line(words, said):
+def test_usage_errors_are_one_line(words, said):
     assert processes.refuse(*words.split()).startswith(f"error: {said}")
 
 
@@ -116,7 +116,7 @@ def test_old_names_are_answered_with_the_new_ones(words, new, tmp_path):
 
 
 def completed(words, cwd):
-    """Return what a shell is told where it asks for what may follow `words`."""
+    """Return the completions that a shell gets after `words`."""
     asked = {f"_{words[0].upper()}_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(words)}
     asked["COMP_CWORD"] = str(len(words) - 1)
     return processes.succeed(words[0], cwd=cwd, env=os.environ | asked).stdout.split()
@@ -144,7 +144,7 @@ def test_completion_installs_itself(tmp_path):
     assert "calib" in (tmp_path / ".bashrc").read_text()
 
 
-def test_what_the_help_lists_is_what_the_packages_know():
+def test_help_lists_the_registered_names():
     parameters = {
         (" ".join(words), p.name): p.metavar.replace(" ", "").split("|")
         for words, c in EVERY
@@ -182,7 +182,7 @@ def test_help_is_printed_before_anything_heavy_is_imported(package):
     """`uwblink import` lists the table of importers, plug-ins included, so its commands may import three of them."""
     called = [[package], *(words for words, _ in EVERY if words[0] == package)]
     assert len(called) > 5
-    # What one command imports stays for those after it, so the importers come last.
+    # Imports of one command remain for the next ones, so the importers come last.
     called.sort(key=lambda words: words[1:2] == ["import"])
     script = [sys.executable, "-c", SCRIPT, package, json.dumps(called), json.dumps(HEAVY)]
     seen = json.loads(subprocess.run(script, capture_output=True, text=True, check=True).stdout)
@@ -191,7 +191,7 @@ def test_help_is_printed_before_anything_heavy_is_imported(package):
         assert set(loaded) <= ({"numpy", "scipy", "duckdb"} if words[1:2] == ["import"] else set()), words
 
 
-# The three commands: versions, usage errors, Ctrl-C while they begin; and they behave in forks as in new processes.
+# The three commands: versions, usage errors, Ctrl-C during their start; and forks behave as new processes do.
 
 
 @pytest.mark.parametrize("command", ["uwbsim", "uwblink", "calib"])

@@ -1,4 +1,4 @@
-"""Ids of 16 bits, as other boards have them, from a scenario to corrected ranges; only this project's boards have 8."""
+"""Ids of 16 bits, as on other boards, from a scenario to corrected ranges; only the project's boards have 8 bits."""
 
 import re
 from typing import Any
@@ -17,7 +17,7 @@ LARGEST = 65535
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A flight without noise whose tags 1 to 6 are called 65535 to 65530."""
+    """A flight without noise whose tags 1 to 6 have the ids 65535 to 65530."""
     folder = tmp_path_factory.mktemp("ids")
     text = re.sub(
         r"^id = (\d)$",
@@ -31,7 +31,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_flights_fits_and_corrections_take_them(folder):
+def test_large_ids_work_in_flights_fits_and_corrections(folder):
     ids = {*range(LARGEST - 5, LARGEST + 1)}
     succeed("calib", "fit", "flight.uwb", "-o", "c.json", cwd=folder)
     assert calib.load_calibration(folder / "c.json").delays_ns.keys() == ids
@@ -46,7 +46,7 @@ def test_flights_fits_and_corrections_take_them(folder):
     assert streamed.stderr.startswith(f"{len(again)} ranges")
 
 
-def test_places_of_boards_take_them_and_plans_of_our_boards_do_not(folder):
+def test_large_ids_work_for_other_boards_only(folder):
     stamps: Any = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(40, dtype=np.int64))
     exchanges = uwblink.Exchanges.from_arrays(300, LARGEST, time_ns=np.arange(40) * 10**8, range_m=5.1, **stamps)
     uwblink.Contents(exchanges=exchanges).save(folder / "bare.uwb")
@@ -63,7 +63,7 @@ def test_places_of_boards_take_them_and_plans_of_our_boards_do_not(folder):
     assert uwblink.RangingPlan(pairs=((1, 254),)).pairs == ((1, 254),)
 
 
-def test_what_is_known_of_a_survey_takes_them(tmp_path):
+def test_large_ids_work_in_known_facts(tmp_path):
     (tmp_path / "known.toml").write_text(
         f"[[distances]]\nbetween = [{LARGEST}, 300]\ndistance_m = 3.0\n"
         f"[[positions]]\ntag = {LARGEST}\nposition_m = [0.0, 0.0, 0.0]\n"

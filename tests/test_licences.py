@@ -1,4 +1,4 @@
-"""What pip users get: scenarios, reproducible builds, a whole tree; and licences, hashes and lowest versions of all."""
+"""Packages for pip users: scenarios, reproducible builds, a complete tree; licences, hashes and lowest versions."""
 
 import os
 import re
@@ -40,7 +40,7 @@ def test_the_sdist_has_what_make_demo_and_the_tests_need(archives):
     assert sorted(tracked - names) == []
 
 
-def test_links_of_the_page_of_the_package_are_absolute_and_lead_to_files_of_the_sdist(archives):
+def test_links_of_the_package_page_are_absolute_and_valid(archives):
     wheel = zipfile.ZipFile(archives[0])
     (name,) = (name for name in wheel.namelist() if name.endswith(".dist-info/METADATA"))
     page = str(message_from_bytes(wheel.read(name)).get_payload())
@@ -50,7 +50,7 @@ def test_links_of_the_page_of_the_package_are_absolute_and_lead_to_files_of_the_
     assert len(links) == len(re.findall(r"\]\((\S+?)\)", (ROOT / "README.md").read_text(encoding="utf-8"))) > 10
     assert [link for link in links if not link.startswith("https://")] == []
     (image,) = re.findall(r"!\[[^\]]+\]\((\S+)\)", page)
-    assert image.startswith("https://raw.githubusercontent.com/")  # the page of a file on GitHub is no picture
+    assert image.startswith("https://raw.githubusercontent.com/")  # the page of a file on GitHub is not a picture
     own = [re.fullmatch(r"https://\S+/uwbcal/(?:blob/)?main/([^?#]+)\S*", link) for link in links]
     assert [found[1] for found in own if found and found[1] not in files] == []
     assert sum(found is not None for found in own) > 10
@@ -61,14 +61,14 @@ def test_two_builds_are_the_same_bytes_wherever_the_tree_lies(archives, tmp_path
     with tarfile.open(archives[1]) as archive:
         archive.extractall(tmp_path, filter="data")
     (tree,) = tmp_path.iterdir()
-    for path in tree.rglob("*.py"):  # another day, another hand
+    for path in tree.rglob("*.py"):  # another date and another user
         os.utime(path, (1, 1))
     again = built(tmp_path / "dist", of=tree)
     assert [path.name for path in again] == [path.name for path in archives]
     assert [path.read_bytes() for path in again] == [path.read_bytes() for path in archives]
 
 
-# Everything in the lock is in docs/licences.md, and nothing incompatible is; every dependency has a lowest version.
+# docs/licences.md has all packages of the lock file, all compatible; every dependency has a lowest version.
 
 
 LOCKED, TEXT = LOCK.read_text(encoding="utf-8"), PAGE.read_text(encoding="utf-8")
@@ -76,7 +76,7 @@ LINES = re.findall(r"^\| ([^|]+) \| (.*?)(?: \([^|]*\))? \| ([^|]+) \|$", TEXT, 
 ROWS = sorted((name, licence, purpose) for purpose, licence, names in LINES for name in names.split(", "))
 
 
-def test_the_page_lists_what_the_lock_does_and_all_of_it_is_compatible():
+def test_the_page_lists_compatible_licences_of_all_locked_packages():
     assert [name for name, _, _ in ROWS] == names_of(LOCKED)
     assert [row for row in ROWS if not row[1] or not allowed(row[0], row[1])] == []
     linked = {name for name, licence, purpose in ROWS if licence in LINKED and purpose == "always"}
@@ -90,7 +90,7 @@ def test_the_page_lists_what_the_lock_does_and_all_of_it_is_compatible():
         *((each, True) for each in ("MIT", "GPL-2.0-only OR MIT", "Apache-2.0 WITH LLVM-exception", "BSD AND MIT")),
     ],
 )
-def test_licences_are_told_apart(licence, compatible):
+def test_licences_are_distinguished(licence, compatible):
     assert allowed("one", licence) == compatible
     assert "one" not in JUDGED
 

@@ -1,4 +1,4 @@
-"""A protocol registered at run time goes through every command, and is exact where there is no noise."""
+"""A protocol registered at run time works with every command, and is exact without noise."""
 
 import json
 import shlex
@@ -19,7 +19,7 @@ SCENARIO = "scenarios/noiseless.toml"
 
 
 def command(*words):
-    """Run a command in this process, which alone knows the protocol; returns what it prints."""
+    """Run a command in this process, which has registered the protocol; return its output."""
     return pages.command(shlex.join(map(str, words)))
 
 
@@ -36,7 +36,8 @@ def test_simulated_ranges_are_exact_up_to_skew_and_planted_delays(row, delays):
     weights = delay_weights(result.exchanges)
     calibrated = raw_range(result.exchanges) + SPEED_OF_LIGHT * 1e-9 * (weights[0] * delays[0] + weights[1] * delays[1])
     assert len(result.exchanges) == 200
-    # Whole ticks of 4.7 mm, weighted by up to 1.2 and averaged in part; a flight of 10 ns is 5e-14 s long by its skew.
+    # Whole ticks of 4.7 mm, with weights up to 1.2, partly averaged; a flight of 10 ns is longer by 5e-14 s by its
+    # skew.
     assert np.abs(calibrated - result.truth_m).max() < 0.012
     assert abs(np.mean(calibrated - result.truth_m)) < 0.0015
 
@@ -51,7 +52,7 @@ def test_prediction_and_monte_carlo_agree_with_each_other_and_with_the_formula(r
     assert range_errors_m(row, one, 1, 1)[0] == pytest.approx(quiet.mean_m[0], abs=1e-6)
     noisy = one.with_columns(rx_std=150e-12)[np.zeros(16_384, dtype=np.int64)]
     errors = range_errors_m(row, noisy, 2, 200_000)
-    # 200 000 errors know their standard deviation to 0.16 %.
+    # 200,000 errors determine their standard deviation to 0.16 %.
     assert errors.std() == pytest.approx(np.sqrt(predict(row, noisy).variance_m2[0]), rel=0.01)
 
 
@@ -63,13 +64,13 @@ def test_run_show_and_fit(row, tmp_path):
     command("calib", "fit", flight, "-o", fitted)
     flown = load(flight)
     assert set(flown.exchanges.protocol.tolist()) == {row.name}
-    # The scenario has no bias; 60 s of noiseless stamps leave a picosecond, and the spline's wiggle.
+    # The scenario has no bias; 60 s of noiseless stamps leave a picosecond, and a small variation of the spline.
     found = json.loads(fitted.read_text())["delays_ns"]
     assert found == pytest.approx(flown.meta["planted"]["delays_ns"], abs=5e-3)
 
 
 @pytest.mark.parametrize("row", [SYMMETRIC], indirect=True)
-def test_compare_optimum_and_predict_know_it_without_being_told(row, tmp_path, monkeypatch):
+def test_compare_optimum_and_predict_support_a_new_protocol(row, tmp_path, monkeypatch):
     monkeypatch.setattr("uwblink.pages.figures.drawn", pages.outline)
     compared = json.loads(command("uwbsim", "compare", SCENARIO, "-o", tmp_path / "out", "-n", 256, "--json"))
     assert [line["protocol"] for line in compared["protocols"]] == list(PROTOCOLS)
@@ -81,6 +82,6 @@ def test_compare_optimum_and_predict_know_it_without_being_told(row, tmp_path, m
     assert (said["title"], said["std_m"] > 0) == (row.title, True)
 
 
-def test_schema_and_summary_know_it(row):
+def test_schema_and_summary_contain_the_new_protocol(row):
     assert row.name in json.loads(command("uwbsim", "schema"))["$defs"]["Ranging"]["properties"]["protocol"]["enum"]
     assert row.title in command("uwbsim", "validate", SCENARIO, "--set", f"ranging.protocol={row.name}")

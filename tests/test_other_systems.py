@@ -1,4 +1,4 @@
-"""Commands where the system lacks what Linux has: no pseudo-terminals, no file locks of POSIX, no masks of signals."""
+"""Commands on systems without features of Linux: pseudo-terminals, POSIX file locks, signal masks."""
 
 import os
 import subprocess
@@ -6,7 +6,7 @@ import sys
 
 from tests.shared_data import ROOT
 
-# Libraries are imported before: their own variants for other systems are theirs to test.
+# Libraries are imported before: their own variants for other systems are not tested here.
 WITHOUT = """
 import os, signal, sys
 import duckdb, matplotlib.figure, multiprocessing, numpy, scipy.sparse.linalg, serial, serial.tools.list_ports, simpy

@@ -1,4 +1,4 @@
-"""Every block of code on every page of the documentation works, or says why it is not run."""
+"""Every block of code on every page of the documentation works, or states why it is not run."""
 
 import json
 import shutil
@@ -19,7 +19,7 @@ FIT = "calib fit train.uwb -o calibration.json"
 
 @pytest.fixture(scope="session")
 def recordings(tmp_path_factory):
-    """A folder as the pages find it: the repository's files, two flights and a calibration."""
+    """A folder as assumed by the pages: the repository's files, two flights and a calibration."""
     folder = tmp_path_factory.mktemp("pages")
     for name in ("scenarios", "docs"):
         (folder / name).symlink_to(pages.ROOT / name)

@@ -1,4 +1,4 @@
-"""Rows of other distributions: installed by pip into a folder of their own, and used through the commands."""
+"""Rows of other distributions: installed by pip into a separate folder, and used through the commands."""
 
 import json
 import os
@@ -19,7 +19,7 @@ from uwblink import Recording
 from uwblink.errors import ArgumentError, PluginWarning
 from uwblink.plugins import Registry
 
-# The example of CONTRIBUTING.md, and two rows that cannot be used.
+# The example of CONTRIBUTING.md, and two rows with errors.
 PROJECT, MODULE = (
     next(b.code for b in pages.blocks(pages.ROOT / "CONTRIBUTING.md") if b.language == language and word in b.code)
     for language, word in (("toml", "uwbcal.protocols"), ("python", "PROTOCOL = "))
@@ -31,7 +31,7 @@ MODULE += 'BAD = RobustLoss("bad", lambda u: (u, u))\n'
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
-    """The environment of a process that has the distribution."""
+    """Return the environment of a process with the distribution."""
     source, site = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("site")
     (source / "strange_ranging").mkdir()
     (source / "pyproject.toml").write_text(PROJECT)
@@ -44,7 +44,7 @@ def installed(tmp_path_factory):
 
 @pytest.fixture
 def run(installed):
-    """Runs a command in a process that finds the distribution."""
+    """Return a function that runs a command in a process with the distribution."""
     return partial(processes.run, env=installed, timeout=300)
 
 
@@ -82,7 +82,7 @@ def test_an_effect_of_another_distribution_applies_to_the_flights_of_the_command
 
 
 @pytest.mark.slow
-def test_workers_in_other_processes_know_it_too(run, tmp_path):
+def test_workers_in_other_processes_load_the_plugin(run, tmp_path):
     (tmp_path / "s.toml").write_text(
         '[sweep]\nscenario = "noiseless"\nprotocols = ["strange-ds"]\n'
         "ranges = 1000\nseeds = [1, 2]\n[vary]\n'radio.rx_noise_ps' = [100.0, 200.0]\n"
@@ -149,7 +149,7 @@ def check(row):
 
 @pytest.fixture
 def table(monkeypatch):
-    """A table with one row of its own, and entry points that name rows, a list of them, and mistakes."""
+    """A table with one built-in row, and entry points that name rows, a list of them, and errors."""
     entries = [EntryPoint(f"e{k}", f"tests.test_plugins:{name}", "g") for k, name in enumerate(ENTRIES)]
     asked = []
 
@@ -188,7 +188,7 @@ def test_entry_points_are_loaded_once_and_only_when_they_are_needed(table):
         assert ("nothing" in registry, len(registry), asked) == (False, 4, ["g"])
 
 
-def test_a_name_that_is_not_among_the_known_is_looked_for(table):
+def test_unknown_names_are_looked_up_in_plug_ins(table):
     registry, asked = table
     with pytest.warns(PluginWarning):
         assert registry["three"] is MANY[1]

@@ -1,4 +1,4 @@
-"""The commands and the script of the README, and the commands for boards, run as they stand there."""
+"""The commands and the script of the README, and the commands for boards, run as written."""
 
 import json
 import os
@@ -23,7 +23,7 @@ SCRIPT = (pages.DOCS / "examples" / "first_calibration.py").read_text(encoding="
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """The working folder as the README has it."""
+    """The working folder as assumed by the README."""
     for name in ("scenarios", "docs"):
         (tmp_path / name).symlink_to(pages.ROOT / name)
     monkeypatch.chdir(tmp_path)
@@ -40,7 +40,7 @@ def test_the_commands_and_the_lines_of_python_of_the_readme_print_what_it_says()
             (said,) = (line for line in block.code.splitlines() if line != pages.LEFT)
             (printed,) = (line for line in runner.printed.splitlines() if pages.masked(line) == pages.masked(said))
             for one, other in zip(numbers.findall(printed), numbers.findall(said), strict=True):
-                digit = 10.0 ** -len(one.partition(".")[2])  # versions of libraries move results by a last digit
+                digit = 10.0 ** -len(one.partition(".")[2])  # versions of libraries change last digits of results
                 assert float(one) == pytest.approx(float(other), abs=1.5 * digit), (printed, said)
 
 
@@ -77,21 +77,23 @@ def test_the_script_that_the_readme_names_simulates_fits_corrects_and_judges(fol
     assert (folder / "first.json").exists()
     range_m, sigma_m = map(float, re.search(r"3.21 m corrected: (\S+) m, .* (\S+) m", runner.printed).groups())
     first_m = float(re.search(r"^\[ *(\S+) +\S+ +\S+ *\]$", runner.printed, flags=re.MULTILINE)[1])
-    # The first of the array has the same range, and both powers where the one has its first: some millimetres apart.
+    # The first of the array has the same range, and both powers where the single one has its first: some millimetres
+    # apart.
     assert abs(first_m - range_m) < 0.03
     assert 0.03 < sigma_m < 0.15
     raw, full = (
         tuple(map(float, re.search(rf"{name} +mean (\S+) cm.*deviation (\S+) cm", runner.printed).groups()))
         for name in ("raw", "corrected")
     )
-    # What the paper's flights leave: reflections keep the mean above zero, and the spread falls to the noise's.
+    # As in the flights of the paper: reflections keep the mean above zero, and the spread decreases to that of the
+    # noise.
     assert abs(full[0]) < 0.6 * abs(raw[0])
     assert full[1] < 0.9 * raw[1]
 
 
 @contextmanager
 def serving(folder, label, *files):
-    """Run a server of the page in a folder until the block ends; `files` are there when it begins."""
+    """Run a server of the page in a folder until the block ends; `files` exist when it starts."""
     (serve,) = BOARDS[label]
     words = serve.split()
     server = subprocess.Popen([processes.BIN / words[0], *words[1:]], cwd=folder, stdout=subprocess.DEVNULL)
@@ -119,14 +121,14 @@ def test_the_commands_for_boards_work_on_served_ones(folder):
 
 
 @pytest.mark.slow
-def test_the_way_from_served_drones_to_a_calibration_works(folder):
+def test_served_drones_can_be_calibrated(folder):
     with serving(folder, "serve-drones", "motion.csv", "drones/tag6"):
         for command in BOARDS["drones"]:
             processes.succeed(*command.split(), cwd=folder)
     fitted = json.loads((folder / "drones.json").read_text())["delays_ns"]
     tags = tomllib.loads((folder / "scenarios/icra2023/train.toml").read_text())["tags"]
     apart = np.array([fitted[str(tag["id"])] - tag["delay_ns"] for tag in tags])
-    # A shift common to all delays is the curve's constant; apart from it they are found to 0.15 ns from 20 s.
+    # A common shift of all delays is the constant of the curve; differences are known to 0.15 ns from 20 s.
     assert np.abs(apart - apart.mean()).max() < 0.15
 
 

@@ -47,7 +47,7 @@ def test_a_map_knows_the_tables_that_its_reference_has():
 
 
 def flat(table, above=""):
-    """Every key of a JSON document, dotted; names that people or data choose in capitals."""
+    """Yield every key of a JSON document with dots; names that users or data choose are in capitals."""
     for key, value in table.items():
         free = dict.fromkeys(("delays_ns", "delays_std_ns", "antenna_delays"), "TAG")
         free |= {"groups": "NAME", "errors.features": "NAME", "provenance": "KEY"}
@@ -88,7 +88,7 @@ def test_every_offered_name_is_in_the_reference(package):
     )
 
 
-def test_what_doors_return_is_in_the_reference():
+def test_results_of_public_functions_are_in_the_reference():
     page = doors.reference("calib")
     names = ("evaluation.statistics.Stats", "calibration.model.Uncertainty", "findings.Finding")
     for name in names:

@@ -1,4 +1,4 @@
-"""Every scenario in the tree runs, at a few seconds' length, and its recording opens."""
+"""Every scenario in the tree runs for a few seconds, and its recording opens."""
 
 import pytest
 
@@ -12,7 +12,7 @@ SCENARIOS = {path.relative_to(FOLDER).as_posix(): path for path in sorted(FOLDER
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_scenario_runs(name, tmp_path):
     output = tmp_path / "out.uwb"
-    # Thirty hours of an exchange every twenty seconds have none in the first three seconds.
+    # Thirty hours with an exchange every twenty seconds have none in the first three seconds.
     seconds = 300 if name.startswith("wrap/") else 3
     done = processes.run("uwbsim", "run", SCENARIOS[name], "-o", output, "--set", f"run.duration_s={seconds}")
     assert done.returncode == 0, done

@@ -1,4 +1,4 @@
-"""The scoreboard's figures are those of what its commands write, computed here by NumPy alone."""
+"""Values of the scoreboard are those of the files that its commands write, computed here by NumPy alone."""
 
 import csv
 import re
@@ -18,7 +18,7 @@ CM = 100
 
 @pytest.fixture
 def folder(tmp_path, request):
-    """A folder that has the files of one data set, and no other."""
+    """A folder with the files of one data set only."""
     here = tmp_path / "data"
     here.mkdir()
     for name in request.param:
@@ -27,7 +27,7 @@ def folder(tmp_path, request):
 
 
 def table(page):
-    """The rows of the first table, by ranges and calibration."""
+    """Return the rows of the first table, by ranges and calibration."""
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")]
     return {(row[0], row[1]): row[2:] for row in rows[1:]}
 
@@ -41,7 +41,7 @@ def spread(errors):
 
 
 def corrected(work, recording, calibration):
-    """Raw and corrected errors in metres (n,) of a recording, and their sigma, by what `calib apply` writes."""
+    """Return raw and corrected errors in metres (n,) of a recording, and their sigma, as written by `calib apply`."""
     processes.succeed("calib", "apply", recording, "-c", calibration, "-o", "applied", "--to", "csv", cwd=work)
     columns = []
     for name in ("exchanges", "corrected"):
@@ -59,7 +59,7 @@ MILUV = ["miluv_cirObstacles_3_random_0.tar.xz", "miluv_published_calibration.js
 
 
 def holds(row, errors):
-    """A row has the median and the robust deviation of errors in metres, to the millimetre that it shows."""
+    """Return whether a row has median and robust deviation of errors in metres, to the millimetre that it shows."""
     assert (int(row[0]), number(row[1])) == (len(errors), pytest.approx(CM * np.median(errors), abs=0.0501))
     assert number(row[2]) == pytest.approx(CM * spread(errors), abs=0.0501)
 
@@ -69,7 +69,7 @@ def forked(line, *, cwd, **_):
 
 
 def written(folder, tmp_path, monkeypatch):
-    """The page of a folder with one data set, and where the files of its commands are."""
+    """The page of a folder with one data set, and the folder with the files of its commands."""
     monkeypatch.setattr("benchmarks.scoreboard.subprocess.run", forked)
     work = tmp_path / "work"
     work.mkdir()
@@ -83,7 +83,7 @@ def test_rows_are_what_calib_apply_gives_and_data_sets_that_are_absent_are_named
     page, work = written(folder, tmp_path, monkeypatch)
     rows = table(page)
     raw, ours, _ = corrected(work, "half2.uwb", "half1.json")
-    # The samples are biases, so what is written has them unchanged: every second one.
+    # The samples are biases, so the files have every second one unchanged.
     bias = np.loadtxt(folder / PAPER[0], delimiter=",", skiprows=1)[1::2, 1]
     assert np.sort(raw) == pytest.approx(np.sort(bias), abs=1e-6)
     holds(rows["half2", "none"], raw)
@@ -93,7 +93,7 @@ def test_rows_are_what_calib_apply_gives_and_data_sets_that_are_absent_are_named
         one.name for one in scoreboard.DATA_SETS if one.archive not in PAPER
     ]
     assert "error: samples.csv: no column" in page
-    # Recipes stand for all, there or not.
+    # Recipes of all data sets are shown, also of missing ones.
     assert page.count("```sh") == len(scoreboard.DATA_SETS)
 
 
@@ -112,7 +112,7 @@ def test_a_flight_is_judged_with_the_published_calibration_and_on_what_was_held_
 
 
 @pytest.mark.parametrize("folder", [SWARM], indirect=True)
-def test_boards_that_stand_nowhere_known_are_judged_by_the_spread_within_pairs(folder, tmp_path, monkeypatch):
+def test_boards_at_unknown_positions_are_evaluated_within_pairs(folder, tmp_path, monkeypatch):
     page, work = written(folder, tmp_path, monkeypatch)
     rows = {name: row for (name, _), row in table(page).items() if "held out" in name}
     assert sorted(rows) == ["110-1, held out", "70-1, held out", "90-1, held out"]
@@ -120,7 +120,7 @@ def test_boards_that_stand_nowhere_known_are_judged_by_the_spread_within_pairs(f
         e = load(work / f"{name.split(',')[0]}.uwb").exchanges
         link = e.initiator.astype(int) * 1000 + e.target
         errors = np.concatenate([e.range_m[link == k] - np.median(e.range_m[link == k]) for k in np.unique(link)])
-        # Half of the ranges, by constants of the other half.
+        # Half of the ranges, corrected with constants of the other half.
         assert int(row[0]) == pytest.approx(len(e) / 2, rel=0.03)
         assert abs(number(row[1])) < 1.0
         assert number(row[2]) == pytest.approx(CM * spread(errors), rel=0.15)

@@ -1,4 +1,4 @@
-"""What docs/security.md says of files from strangers and of outputs, each by what tries to break it."""
+"""Statements of docs/security.md on untrusted files and on outputs, each tested by an attack."""
 
 import ast
 import functools
@@ -25,12 +25,12 @@ from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_ex
 PACKAGES = ("uwblink", "uwbsim", "calib")
 SECRET = "what nobody else may read"  # noqa: S105 - of this test
 STORAGE_OF_1_5 = 68
-"""What DuckDB 1.5 calls the storage that it writes, in the header of a file."""
+"""Version of the storage that DuckDB 1.5 writes, in the header of a file."""
 
 
 @pytest.fixture(scope="module")
 def seeds(tmp_path_factory):
-    """A flight, its scenario, a sweep and its results; and a file that nobody names."""
+    """A flight, its scenario, a sweep and its results; and a file that no other file names."""
     folder = tmp_path_factory.mktemp("seeds")
     text = (ROOT / "scenarios" / "noiseless.toml").read_text().replace("duration_s = 60.0", "duration_s = 1.0")
     (folder / "s.toml").write_text(text)
@@ -43,14 +43,14 @@ def seeds(tmp_path_factory):
 
 @pytest.fixture
 def place(seeds, tmp_path):
-    """A folder of our own with all of that."""
+    """A separate folder with all of these."""
     folder = tmp_path / "place"
     shutil.copytree(seeds, folder)
     return folder
 
 
 def refused(*words, naming=(), **how):
-    """Run a command that must end with one line, which names what it must and quotes no secret."""
+    """Run a command that must end with one line, which has given texts and contains no secret."""
     assert SECRET not in refuse(*words, naming=naming, **how)
 
 
@@ -58,11 +58,11 @@ def names(folder):
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
 
 
-# One place opens DuckDB.
+# One module opens DuckDB.
 
 
 def taken_from_duckdb(source):
-    """Return what a module takes from duckdb beside types, errors and its version."""
+    """Return the names that a module uses of duckdb, except types, errors and the version."""
     found = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "duckdb":
@@ -80,7 +80,7 @@ def test_one_module_opens_duckdb():
         assert taken_from_duckdb(source)
 
 
-# Sweep folders of strangers.
+# Untrusted sweep folders.
 
 
 RESUME = ("sweep", "plan.toml", "-o", "results", "--resume", "--workers", "1")
@@ -101,7 +101,7 @@ RESUME = ("sweep", "plan.toml", "-o", "results", "--resume", "--workers", "1")
         ["INSERT INTO results SELECT 0, 9, '{{\"a\": \"' || repeat('x', 200000) || '\"}}'"],
     ],
 )
-def test_a_sweep_folder_of_a_stranger_holds_results_and_no_programs(place, statements):
+def test_untrusted_sweep_folders_with_programs_are_refused(place, statements):
     with duckdb.connect(str(place / "results" / "results.duckdb")) as db:
         for statement in statements:
             db.execute(statement.format(secret=place / "secret.txt"))
@@ -131,7 +131,7 @@ LINKS = {
 
 
 def linked(place, name, text="a\n1\n"):
-    """Put a file that a scenario may not read where `name` says; returns its name as the scenario has it."""
+    """Make a link `name` to a file that a scenario may not read; return its name in the scenario."""
     (place / "s").mkdir(exist_ok=True)
     (place / "s" / "s.toml").write_text((place / "s.toml").read_text())
     inside = place / "s" / "in.csv"
@@ -153,14 +153,14 @@ def linked(place, name, text="a\n1\n"):
 @pytest.mark.parametrize(
     "name", ["outside", "absolute", "NUL", "pipe", "large", "/dev/zero", "../secret.txt", "folder"]
 )
-def test_a_scenario_reaches_no_file_that_nobody_named(place, key, name):
+def test_scenarios_cannot_read_unnamed_files(place, key, name):
     text = LINKS[key].format(name=json.dumps(linked(place, name)))
     with pytest.raises(uwbsim.UwbsimError, match=r"\.file: found") as caught:
         uwbsim.load(place / "s" / "s.toml", [text])
     assert SECRET not in str(caught.value)
 
 
-def test_an_allowed_folder_holds_files_of_scenarios(place):
+def test_scenarios_read_files_of_an_allowed_folder(place):
     (place / "other").mkdir()
     (place / "other" / "slots.csv").write_text("time_s,initiator,target\n0,1,2\n0.1,2,3\n")
     linked(place, "outside")
@@ -172,7 +172,7 @@ def test_an_allowed_folder_holds_files_of_scenarios(place):
     assert plan.model_dump()["slots"] == ((0.0, 1, 2), (0.1, 2, 3))
 
 
-def test_a_sweep_reaches_no_scenario_that_nobody_named(place):
+def test_sweeps_cannot_read_unnamed_scenarios(place):
     (place / "s").mkdir()
     plan = place / "s" / "plan.toml"
     words = ("uwbsim", "sweep", plan, "-o", place / "out", "--workers", 1)
@@ -192,7 +192,7 @@ def test_a_sweep_without_end_is_refused(place, design):
     assert not (place / "out").exists()
 
 
-# What lies beside a file of a stranger.
+# Files beside an untrusted file.
 
 
 @pytest.mark.parametrize("kind", ["link", "dangling", "pipe"])
@@ -205,7 +205,7 @@ def test_a_sweep_without_end_is_refused(place, design):
         ["uwblink", "export", "f.uwb", "--to", "csv", "-o", "out"],
     ],
 )
-def test_what_lies_beside_a_recording_leads_nowhere(place, kind, beside, words):
+def test_files_beside_a_recording_have_no_effect(place, kind, beside, words):
     (place / "poses.csv").write_text("time_s,body,x,y,z,qx,qy,qz,qw\n0,ifo001,0,0,0,0,0,0,1\n1,ifo001,0,0,0,0,0,0,1\n")
     log = place / f"f.uwb{beside}"
     if kind == "pipe":
@@ -224,7 +224,7 @@ def test_a_recording_is_a_file(place):
         refused("uwblink", "show", name, cwd=place, naming=[name])
 
 
-# What a stranger's file says.
+# Texts in untrusted files.
 
 STEERING = "\x1b[31m\x1b]0;title\x07<script>alert(1)</script>/../../../../evil\u202e"
 PRINTING = (
@@ -237,13 +237,14 @@ PRINTING = (
     "calib fit hostile.uwb -o out.json",
     "calib evaluate hostile.uwb -c c.json",
     "calib localize hostile.uwb -c c.json --seeds 1 --tum out",
-    pytest.param("calib report hostile.uwb -o out.html", marks=pytest.mark.slow),  # pages: tests/calib/report
+    # pages are tested in tests/calib/report
+    pytest.param("calib report hostile.uwb -o out.html", marks=pytest.mark.slow),
 )
 
 
 @pytest.fixture(scope="module")
 def hostile(tmp_path_factory):
-    """A flight with names that would steer a terminal, run in a page, or lead elsewhere; and a calibration."""
+    """A flight with names that would control a terminal, run in a page, or lead to other files; and a calibration."""
     folder = tmp_path_factory.mktemp("hostile") / "deep" / "in" / "here"
     folder.mkdir(parents=True)
     flight = calib.sample_flight(300)
@@ -257,7 +258,7 @@ def hostile(tmp_path_factory):
 
 
 @pytest.mark.parametrize("line", PRINTING)
-def test_what_a_file_says_steers_nothing(hostile, line):
+def test_texts_in_files_control_no_terminal_page_or_path(hostile, line):
     ended = run(*line.split(), cwd=hostile)
     assert ended.returncode in (0, 2), ended
     assert all(c.isprintable() or c == "\n" for c in ended.stdout + ended.stderr), ended
@@ -278,7 +279,7 @@ WRITERS = (
 
 
 @pytest.mark.parametrize(("line", "output"), WRITERS)
-def test_outputs_go_through_no_planted_link(place, line, output):
+def test_outputs_do_not_follow_planted_links(place, line, output):
     secret, path = place / "secret.txt", place / output
     for name in (path.name, f"{path.name}.wal", f".{path.name}.partial", f".{path.name}.{os.getpid()}.partial"):
         link = path.with_name(name)
@@ -355,13 +356,13 @@ def test_an_output_that_cannot_be_written_leaves_the_folder_that_it_would_have_r
 
 
 def storage(path):
-    """Return the number of a file's storage, as DuckDB's first header has it."""
+    """Return the version of the storage of a file, from DuckDB's first header."""
     head = path.read_bytes()[:20]
     assert head[8:12] == b"DUCK"
     return struct.unpack("<Q", head[12:20])[0]
 
 
-def test_what_is_written_the_lowest_allowed_version_reads(place):
+def test_the_lowest_allowed_duckdb_reads_recordings(place):
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     assert f'"duckdb>={STORAGE_VERSION.removeprefix("v").rpartition(".")[0]}.' in text
     with uwblink.Recording.create(place / "live.uwb", live=True):
@@ -371,7 +372,7 @@ def test_what_is_written_the_lowest_allowed_version_reads(place):
     assert [storage(path) for path in made] == [STORAGE_OF_1_5] * 4
 
 
-def test_a_file_of_a_newer_duckdb_is_named_so(place):
+def test_files_of_a_newer_duckdb_are_named(place):
     path = place / "newer.uwb"
     with duckdb.connect() as db:
         db.execute(f"ATTACH '{path}' AS newer")
@@ -379,7 +380,7 @@ def test_a_file_of_a_newer_duckdb_is_named_so(place):
     data = bytearray(path.read_bytes())
     data[12:20] = struct.pack("<Q", 5000)
     data[52:60] = b"v9.8.7\0\0"
-    # The checksum of a block: each word times an odd number, all exclusive-or.
+    # The checksum of a block: each word times an odd number, combined by exclusive or.
     words = struct.unpack("<511Q", data[8:4096])
     data[:8] = struct.pack("<Q", functools.reduce(operator.xor, (w * 0xBF58476D1CE4E5B9 % 2**64 for w in words), 5381))
     path.write_bytes(data)

@@ -87,7 +87,7 @@ def folder(tmp_path_factory):
     return found
 
 
-def test_delays_come_out_but_for_what_they_have_in_common(folder):
+def test_differences_determine_delays_minus_their_mean(folder):
     known = calib.load_calibration(folder / "fit.json")
     found = np.array([known.delays_ns[tag] for tag in range(1, 9)])
     std = np.array([known.std_of_sum_ns([tag]) for tag in range(1, 9)])
@@ -102,7 +102,7 @@ def test_delays_come_out_but_for_what_they_have_in_common(folder):
     assert known.sigma_curve(np.ones(1))[0] == pytest.approx(NOISE_M, rel=0.05)
 
 
-def test_the_fit_names_what_stays_free(folder):
+def test_the_fit_names_undetermined_delays(folder):
     printed, warned = ((folder / name).read_text() for name in ("fit.out", "fit.err"))
     assert "0 exchanges, 9600 differences of arrival" in printed
     assert printed.count("less the mean of all") == 8
@@ -113,7 +113,7 @@ def test_the_fit_names_what_stays_free(folder):
         assert abs(pinned.delays_ns[tag] - DELAYS_NS[tag - 1]) < 4 * pinned.delays_std_ns[tag] < 0.13
 
 
-def test_they_are_shown_and_not_streamed(folder):
+def test_differences_are_shown_and_not_streamed(folder):
     assert re.search(
         r"d\.uwb: 9600 differences in (59\.9|60\.0) s\n",
         processes.succeed("uwblink", "show", folder / "fit/d.uwb").stdout,
@@ -123,7 +123,7 @@ def test_they_are_shown_and_not_streamed(folder):
     assert re.search(r"(?s)alone.*9600 differences of arrival and no exchanges.*calib fit --use receptions", said)
 
 
-def test_no_antenna_delays_are_made_up(folder):
+def test_antenna_delays_are_not_invented(folder):
     uwblink.load(folder / "fly/d.uwb").save(folder / "written.uwb", force=True)
     for name in ("fly/d.uwb", "written.uwb"):
         assert "antenna_delay" not in processes.succeed("uwblink", "show", folder / name).stdout
@@ -136,13 +136,13 @@ def test_an_anchor_with_itself_is_named(folder):
     processes.refuse("calib", "fit", "same.uwb", "-o", "x.json", *FIT, cwd=folder, naming=["same.uwb", "at both ends"])
 
 
-def test_what_is_not_determined_is_not_corrected(folder):
+def test_undetermined_differences_are_not_corrected(folder):
     ranges = calib.Ranges.from_arrays([3.0] * 5, initiator=1, target=2)
     with pytest.raises(calib.CalibError, match="only differences of arrival"):
         calib.load_calibration(folder / "fit.json").apply(ranges)
 
 
-def test_the_tag_is_where_it_is(folder):
+def test_a_tag_is_localized_by_differences(folder):
     words = ["calib", "localize", "fly/d.uwb", "-c", "fit.json", "--use", "receptions", "--seeds", "1", "--json"]
     (one,) = json.loads(processes.succeed(*words, cwd=folder).stdout)["scenarios"]
     assert one["arrivals"] == 3200
@@ -186,7 +186,7 @@ def test_a_calibration_of_ranges_corrects_differences(folder):
 @pytest.mark.parametrize(
     "words", [("fit", "-o", "x.json", *FIT), ("localize", "-c", "../fit.json", "--use", "receptions")]
 )
-def test_the_other_sign_is_noticed_by_poses(folder, words):
+def test_the_wrong_sign_is_detected_with_poses(folder, words):
     if not (folder / "swapped").exists():
         imported(folder / "swapped", flown(3, 8.0), swapped=True)
     command, *others = words
@@ -227,7 +227,7 @@ def test_numbers_that_are_no_differences_are_left_out_and_counted(folder):
 
 
 @pytest.mark.slow
-def test_the_other_sign_is_doubted_without_poses(folder):
+def test_the_wrong_sign_has_a_warning_without_poses(folder):
     rows = flown(4, 4.0)
     doubted = imported(folder / "blind", rows, swapped=True, mocap=False)
     believed = imported(folder / "right", rows, mocap=False)
@@ -246,7 +246,7 @@ def test_the_other_sign_is_doubted_without_poses(folder):
         (("apply", "d.uwb", "-c", "../fit.json", "-o", "x.uwb"), ["d.uwb", "3200 differences", "--use receptions"], 2),
     ],
 )
-def test_what_does_not_go_with_differences_is_said(folder, words, naming, status):
+def test_options_that_exclude_differences_are_refused(folder, words, naming, status):
     processes.refuse("calib", *words, cwd=folder / "fly", naming=naming, status=status)
     assert [path.name for path in (folder / "fly").glob("x.*")] == []
 
@@ -287,7 +287,7 @@ def test_ranges_and_differences_are_used_together_and_fitted_apart(folder):
     assert found.rmse_m["variance"].mean() < 0.045
 
 
-def test_a_recording_keeps_them(folder):
+def test_a_recording_keeps_bare_differences(folder):
     contents = uwblink.load(folder / "fly/d.uwb")
     for words in ("export fly/d.uwb --to csv -o exported", "import exported exported -o again.uwb"):
         processes.succeed("uwblink", *words.split(), cwd=folder)

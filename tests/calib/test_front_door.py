@@ -33,7 +33,7 @@ def test_the_examples_run(name, monkeypatch):
     assert (set(LOSSES), dict(SECTIONS)) == (losses, sections)
 
 
-def test_what_is_handed_out_prints_on_a_screen():
+def test_public_results_print_on_a_screen():
     flight = calib.sample_flight(300)
     known = calib.fit(flight).calibration
     ranges = calib.load_ranges(flight)
@@ -44,7 +44,7 @@ def test_what_is_handed_out_prints_on_a_screen():
         assert max(map(len, text.splitlines())) <= 120, type(thing)
 
 
-def test_what_is_no_calibration_is_refused_by_its_parameter(tmp_path):
+def test_other_objects_than_calibrations_are_refused(tmp_path):
     flight = calib.sample_flight()
     result = calib.fit(flight)
     calls: dict[str, Any] = {
@@ -100,7 +100,7 @@ def points_and_curve(axes):
     return points, np.interp(points.get_xdata(), curve.get_xdata(), curve.get_ydata())
 
 
-def test_points_are_the_core_that_the_curve_follows_and_medians_lie_above():
+def test_points_are_the_core_and_medians_lie_above():
     # Planted: a core of 5 cm about zero, a fifth of it lengthened by 40 cm on average.
     rng = np.random.default_rng(5)
     error = rng.normal(0, 0.05, 40_000) + np.where(rng.random(40_000) < 0.2, rng.exponential(0.4, 40_000), 0)
@@ -129,7 +129,7 @@ def test_the_drawn_curve_goes_through_the_drawn_points(fitted):
         assert 10 ** ((float(text.get_text().replace("−", "-")) + 82) / 10) == pytest.approx(place)
 
 
-def test_the_curve_is_drawn_whole_where_its_points_are_few(fitted):
+def test_curves_with_few_points_are_drawn_completely(fitted):
     faint = fitted.ranges[fitted.ranges.fpp1_dbm < np.median(fitted.ranges.fpp1_dbm)]
     known = fitted.calibration
     axes = axes_of(lambda a: curve_over_power(faint, known.apply(faint), known, "bias", a))
@@ -142,7 +142,7 @@ def test_the_sigma_curve_goes_through_its_points(fitted):
     assert np.mean(points.get_ydata() / at) == pytest.approx(1, abs=0.06)
 
 
-def test_one_stray_delay_does_not_flatten_the_others(fitted):
+def test_outlying_delays_do_not_flatten_the_figure(fitted):
     known = fitted.calibration
     std_ns = {**known.delays_std_ns, 9: 300.0, 1: 40.0}
     wild = replace(known, delays_ns={**known.delays_ns, 9: 1000.0}, delays_std_ns=std_ns)
@@ -164,7 +164,7 @@ def test_a_histogram_shows_corrected_errors_whatever_raw_ones_are(fitted, offset
     assert [heights[name] for name in ("raw", "fully corrected")] == pytest.approx([100, 100])
 
 
-def test_the_distribution_says_how_many_errors_are_smaller(fitted):
+def test_the_distribution_shows_shares_of_smaller_errors(fitted):
     applied = fitted.calibration.apply(fitted.ranges)
     line = labelled(axes_of(lambda a: cumulative(fitted.ranges, applied, a)), "fully corrected")
     size = 100 * np.abs(applied.corrected_m - fitted.ranges.truth_m)
@@ -172,7 +172,7 @@ def test_the_distribution_says_how_many_errors_are_smaller(fitted):
         assert 100 * np.mean(size <= x) == pytest.approx(y, abs=0.1)
 
 
-def test_a_delay_that_nothing_determines_is_a_circle_without_an_interval(fitted):
+def test_undetermined_delays_are_drawn_as_circles(fitted):
     known, name = fitted.calibration, "without an interval: pinned or undetermined"
     open_one = replace(known, delays_std_ns=known.delays_std_ns | {1: np.inf})
     open_axes, axes = (axes_of(lambda axes, one=one: delays(one, axes=axes)) for one in (open_one, known))
@@ -187,6 +187,6 @@ def test_planted_delays_are_drawn_moved_by_the_common_shift(fitted):
     assert labelled(axes, "planted, same gauge").get_ydata() == pytest.approx([0.15, -0.15, 0.05, 0.35])
 
 
-def test_a_dictionary_is_no_list_of_paths():
+def test_dictionaries_are_not_lists_of_paths():
     with pytest.raises(calib.BadInputError, match="`data`: found dict, expected a path"):
         calib.fit({"range_m": [3.1], "initiator": [1], "target": [2]})

@@ -68,7 +68,7 @@ def test_free_directions_are_found_and_named(rows, unknowns, free, kind, of):
     assert np.isnan(verdict.covariance[(~verdict.determined)]).all()
 
 
-def test_a_known_unknown_beside_free_ones_keeps_its_variance():
+def test_determined_unknowns_keep_their_variance():
     verdict = judge(from_rows([[1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1]]), DELAYS)
     assert (verdict.determined.tolist(), verdict.std[2]) == ([False, False, True, True], pytest.approx(0.01))
     assert verdict.covariance[2, 3] == pytest.approx(-1e-4)
@@ -84,7 +84,7 @@ def test_a_known_unknown_beside_free_ones_keeps_its_variance():
         (np.eye(2), {"loosest": 0.0}, "loosest"),
     ],
 )
-def test_what_is_no_information_matrix_is_refused(matrix, settings, message):
+def test_wrong_information_matrices_are_refused(matrix, settings, message):
     with pytest.raises(BadInputError, match=message):
         judge(matrix, DELAYS[:2], **settings)
 
@@ -151,7 +151,7 @@ def test_slopes_are_derivatives(error):
         assert found[name][0] == pytest.approx((above - below) / (2 * step), rel=1e-3, abs=1e-5), name
 
 
-def test_a_long_error_was_reflected_and_an_early_one_is_an_outlier():
+def test_long_errors_are_reflections_and_short_ones_outliers():
     assert slopes(0.5).reflected[0] > 0.95
     assert slopes(0.0).reflected[0] < 0.2
     assert slopes(-1.0).inlier[0] < 0.01

@@ -1,6 +1,6 @@
-"""One battery for every kind of board: virtual in process, virtual behind a pseudo-terminal, and real.
+"""Tests of every kind of board: virtual in process, virtual behind a pseudo-terminal, and real.
 
-Real boards are tested when the environment variable UWB_PORTS names two ports, separated by a comma.
+Real boards are tested if the environment variable UWB_PORTS names two ports, separated by a comma.
 """
 
 import ast
@@ -30,7 +30,7 @@ def pair(request):
 
 
 def heard(board, *kinds, within_s=10.0):
-    """Wait for reports of some kinds, as many as are named; a busy machine may take its time."""
+    """Wait for reports of some kinds; under load, this may take long."""
     found: list[m.Message] = []
     until_s = board._transport.now_s() + within_s
     while len(found) < len(kinds) and board._transport.now_s() < until_s:
@@ -53,7 +53,7 @@ def test_every_plain_command_is_answered(pair):
         assert one.request(command) == reply
 
 
-def test_every_kind_of_field_survives_the_way_there_and_back(pair):
+def test_all_kinds_of_fields_are_unchanged_by_a_round_trip(pair):
     one, _ = pair
     echo = one.request(m.DoTests(-12345, "the test string", True, 1.2345, b"\x00\x01\r|\n\xff"))
     assert echo == m.TestsDone(0, -12345, "the test string", True, 1.2345, b"\x00\x01\r|\n\xff")
@@ -79,7 +79,7 @@ def test_single_sided_report_has_no_third_message_and_whole_ticks(pair):
     assert report.range_m == pytest.approx(int((dt41 - dt32) / 2) * 299_702_547 / (128 * 499.2e6), abs=2e-4)
 
 
-def test_every_delay_that_the_driver_sets_is_set_at_the_target_and_works(pair):
+def test_delays_are_set_at_the_target_and_work(pair):
     one, two = pair
     for delay in (280, 700, 3000, 6400, 6500, 1500):
         two.set_response_delay(delay)
@@ -130,7 +130,7 @@ def test_an_impulse_response_comes_with_its_index(pair):
     assert one.range(two.id).neighbour == two.id
 
 
-def test_what_would_harm_a_board_is_never_sent(pair):
+def test_harmful_commands_are_not_sent(pair):
     one, _ = pair
     tests = (m.DoTests(1, "x", True, number, b"") for number in (float("nan"), float("inf"), 9999.1, -9999.1))
     large = m.DoTests(1, "x" * 43, True, 1.0, b"12345")
@@ -158,7 +158,7 @@ def test_the_longest_broadcast_fits_one_packet(pair):
 
 def test_a_target_that_prints_its_impulse_response_is_left_alone(pair):
     one, two = pair
-    # Served boards may be late by more than the driver waits, on a busy machine; then a response may be damaged.
+    # Under load, served boards may be later than the time-out of the driver; then a response may be damaged.
     needed = 10 if one.name.startswith("/dev/pts/") else 20
     good = 0
     for _ in range(20):
@@ -170,8 +170,8 @@ def test_a_target_that_prints_its_impulse_response_is_left_alone(pair):
     assert good >= needed
 
 
-def test_a_board_whose_response_is_coming_in_is_not_asked(pair):
-    """Somebody else, another process say, had it print one: the driver sees it come and waits."""
+def test_a_board_that_prints_a_response_is_not_asked(pair):
+    """Another process lets the board print a response: the driver detects it and waits."""
     one, two = pair
     list(two.reports(0.01))
     one.request(m.RangeCommand(two.id, target_reports=True, get_cir=True))
@@ -179,7 +179,7 @@ def test_a_board_whose_response_is_coming_in_is_not_asked(pair):
     while two._connection.decoder.begun != m.Cir.KEY and two._transport.now_s() < until_s:
         two._pass(0.001)
     assert two.request(m.GetId()) == m.IdReport(two.id)
-    if not one.name.startswith("/dev/pts/"):  # where a busy machine can make it come late
+    if not one.name.startswith("/dev/pts/"):  # at which a loaded machine can be late
         assert len(heard(two, m.Cir)) == 1
 
 
@@ -197,7 +197,7 @@ def test_a_hanging_board_is_named_with_what_was_sent_and_heard(kind):
             _ = Board(port).id
 
 
-# The captured transcripts played as command scripts: virtual boards answer in the firmware's shapes and order.
+# The captured transcripts as command scripts: virtual boards answer in the format and order of the firmware.
 
 
 FILE = Path(__file__).parents[1] / "golden" / "board_transcripts.txt"
@@ -206,7 +206,7 @@ MS = 1_000_000
 
 
 def scripts():
-    """Pieces of the transcript that start with fresh boards: lists of (ms, board, direction, bytes)."""
+    """Return pieces of the transcript that start with fresh boards: lists of (ms, board, direction, bytes)."""
     pieces: list[list[tuple[float, int, str, bytes]]] = []
     current: list[tuple[float, int, str, bytes]] = []
     for text in FILE.read_text().splitlines():
@@ -220,7 +220,7 @@ def scripts():
 
 
 def shape(data):
-    """What must agree: the text, or the key, ids, number of fields, and which of them are literally zero."""
+    """Return the properties to compare: the text, or key, ids, number of fields, and fields that are literally zero."""
     if not re.match(rb"[RS]\d\d\|", data) or data[:3] in (b"R01", b"R03", b"R07", b"S06"):
         return data
     parts = data.rstrip(b"\r\n").split(b"|")
@@ -240,22 +240,22 @@ def test_answers_have_the_firmware_s_shapes_order_and_timing(script):
         if direction == "<-host":
             bench.advance(int(ms * MS))
             bench.boards[board].write(data)
-        elif ms > 9:  # before that boards boot, before the port exists
+        elif ms > 9:  # before that, boards start, before the port exists
             captured[board].append((ms, data))
     bench.advance(int((script[-1][0] + 60) * MS))
     for board, lines in captured.items():
         sent = [(t / MS, data) for t, tag, data in ports.transfers if tag == board]
         assert [shape(data) for _, data in sent] == [shape(data) for _, data in lines]
         for (ours, _), (theirs, data) in zip(sent, lines, strict=True):
-            # Both poll their buffer once a millisecond, at phases of their own; the rest is processor time.
+            # Both poll their buffer once a millisecond, at different phases; the rest is processor time.
             assert ours == pytest.approx(theirs, abs=1.4), data
 
 
 def test_two_commands_in_one_write_execute_the_last_and_retries_are_inherited():
-    # After 20 ms two tries have failed.
+    # After 20 ms, two tries have failed.
     ports = played((0, 1, b"C05|9|0|1|0\r"), (20, 1, b"C05|8|0|1|0\r"), until_ms=80)
     (failed_ns,) = [t for t, _, data in ports.transfers if data.startswith(b"COMMANDED")]
-    # Six tries of 7 ms in all, not six more: the newcomer inherits the count.
+    # Six tries of 7 ms in all, not six more: the new command inherits the count.
     assert failed_ns < 46 * MS
 
 
@@ -264,7 +264,7 @@ def test_a_long_command_that_straddles_a_poll_kills_the_board_in_a_share_of_phas
     for seed in range(200):
         long = (0, 1, b"C06|\x50\x00" + b"a" * 80 + b"\r")
         dead += not played(long, until_ms=10, ports=VirtualPorts(bench_scenario(seed))).bench.boards[1].alive
-    # 55 us between the packets in a period of 1 ms: 5.5 % of phases, 11 of 200, give or take three sigma.
+    # 55 us between the packets in a period of 1 ms: 5.5 % of phases, 11 of 200, within three sigma.
     assert 1 <= dead <= 21
 
 
@@ -282,8 +282,8 @@ def test_a_listener_that_misses_the_response_prints_26_fields_and_otherwise_noth
     ports = played((0, 3, b"C04|1\r"), *ranging, until_ms=10 + 60 * 240, ports=lossy)
     counts = Counter(data.count(b"|") for _, tag, data in ports.transfers if tag == 3 and data[:3] == b"S01")
     assert set(counts) == {21, 26}
-    # A listener that hears the poll hears the other four frames, of which the last is sent only if the initiator heard
-    # the two before (0.7^6), or it misses the response (0.7 x 0.3), which may never have been sent (0.3).
+    # A listener that receives the poll receives the other four frames, the last of which is sent only if the initiator
+    # received the two before (0.7^6); or it misses the response (0.7 x 0.3), which may not have been sent (0.3).
     whole, zeros = 0.7**6, 0.3 + 0.7 * 0.3
     assert counts.total() > 120
     assert counts[26] / counts.total() == pytest.approx(zeros / (zeros + whole), abs=0.097)  # three sigma

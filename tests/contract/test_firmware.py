@@ -1,4 +1,4 @@
-"""What the boards' own firmware was seen to do where frames are lost, boards are busy, and others are on the air."""
+"""Observed behaviour of the boards' firmware with lost frames, busy boards, and other frames in the air."""
 
 from collections import Counter
 
@@ -11,7 +11,7 @@ from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, FinalPayload, Received
 
 
 def played(*writes, until_ms, ports=None):
-    """Write to boards of the bench, (ms, board, bytes) in order of time, and go on for a while."""
+    """Write to boards of the bench, (ms, board, bytes) in order of time, and continue for a while."""
     ports = ports or VirtualPorts(bench_scenario())
     for ms, board, data in writes:
         ports.bench.advance(int(ms * NS_PER_MS))
@@ -21,7 +21,7 @@ def played(*writes, until_ms, ports=None):
 
 
 def said(ports, tag, start=b""):
-    """What a board printed that begins so: (ms, bytes)."""
+    """Return lines of a board with a given start: (ms, bytes)."""
     return [(t / NS_PER_MS, data) for t, who, data in ports.transfers if who == tag and data.startswith(start)]
 
 
@@ -37,7 +37,7 @@ def test_the_initiator_s_final_can_be_lost_too():
     ports = VirtualPorts(bench_scenario(), lost_share=0.4)
     range_often(ports, b"C05|2|1|1|0\r", 300)
     reports, theirs = len(said(ports, 1, b"R05")), len(said(ports, 2, b"S05"))
-    # The firmware at 40 % loss: 209 S05 to 341 R05. Each R05 has its S05 with 0.6; three sigma of 170.
+    # The firmware at 40 % loss: 209 S05 and 341 R05. Each R05 has its S05 with probability 0.6; three sigma of 170.
     assert reports > 125
     assert theirs / reports == pytest.approx(0.6, abs=0.113)
     mine, other = ({data[6:] for _, data in said(ports, *what)} for what in ((1, b"R05"), (2, b"S05")))
@@ -52,13 +52,13 @@ def test_the_delays_that_work_are_those_of_the_firmware(delay, works):
 
 
 def test_a_target_answers_its_host_after_the_exchange():
-    # After 2 ms: between poll and finals.
+    # After 2 ms: between poll and final.
     ports = played((0, 1, b"C05|2|1|1|0\r"), (2, 2, b"C01\r"), until_ms=20)
     assert [[data[:3] for _, data in said(ports, tag)] for tag in (1, 2)] == [[b"R05"], [b"S05", b"R01"]]
 
 
 def sent_frames(ports):
-    """Note every frame that is scheduled."""
+    """Collect every frame that is scheduled."""
     frames, send = [], ports.bench.air.send
 
     def noting(*frame):
@@ -69,11 +69,11 @@ def sent_frames(ports):
     return frames
 
 
-def test_a_target_that_is_told_to_range_itself_never_sends_its_delayed_reply():
-    """Told within the delay of its reply, which is 6 ms here; without target reports nothing keeps it from it."""
+def test_a_target_that_starts_ranging_sends_no_delayed_reply():
+    """The command comes within the delay of its reply, 6 ms here; without target reports the board accepts it."""
     ports = VirtualPorts(bench_scenario())
     frames, asked = sent_frames(ports), b"C05|2|0|1|0\r"
-    # Both try in vain for a while, each in the other's way.
+    # Both try without success for a while, because each blocks the other.
     played((0, 2, b"C08|6000\r"), (5, 1, asked), (7.5, 2, b"C05|3|0|1|0\r"), until_ms=80, ports=ports)
     reply = next(f for f in frames if (f.sender, f.receiver) == (2, 1) and isinstance(f.payload, FinalPayload))
     assert (reply.cancelled, said(ports, 1, b"R05")) == (True, [])
@@ -87,7 +87,7 @@ def test_a_report_is_lost_while_the_bus_is_busy():
     for delay in (1 * NS_PER_US, 50 * NS_PER_US, 200 * NS_PER_US):
         board.usb.send(b"%d" % delay + bytes(100), delay)
     ports.bench.advance(NS_PER_MS)
-    # Two packets of 64 bytes take 110 us; what comes 50 us after the first finds the bus busy.
+    # Two packets of 64 bytes take 110 us; a report 50 us after the first finds the bus busy.
     assert [data.rstrip(b"\0") for _, data in said(ports, 1)] == [b"1000", b"200000"]
 
 
@@ -101,7 +101,7 @@ def test_impulse_responses_follow_reports_by_four_to_six_milliseconds():
 
 
 def test_passive_boards_print_zeros_for_tries_that_fail_and_others_warn():
-    """The target is absent: six tries, of which a listener hears only the poll."""
+    """The target is absent: six tries, of which a listener receives only the poll."""
     ports = VirtualPorts(bench_scenario())
     range_often(ports, b"C05|9|0|1|0\r", 5, listening=[3])
     assert len(said(ports, 1, b"COMMANDED")) == 5
@@ -114,7 +114,7 @@ def test_passive_boards_print_zeros_for_tries_that_fail_and_others_warn():
 
 
 def test_failed_tries_make_bystanders_warn():
-    """The delay is too short: the target answers with its response, six times, and never sends its final."""
+    """The delay is too short: the target answers with its response six times, and never sends its final."""
     ports = played((0, 2, b"C08|200\r"), until_ms=5)
     range_often(ports, b"C05|2|0|1|0\r", 1)
     assert Counter(data[:11] for _, data in said(ports, 3)) == {b"WARNING 0xB": 6}
@@ -140,7 +140,7 @@ def test_a_listener_that_misses_the_last_frame_is_deaf_until_another_comes():
 
 @pytest.mark.slow
 def test_passive_boards_answer_late_where_frames_are_lost():
-    """Asked 15 ms before the next exchange: the firmware answered 5 of 60 C01s only when that came, the others soon."""
+    """Asked 15 ms before the next exchange: the firmware answered 5 of 60 C01 only at that exchange, others soon."""
     waits = []
     for seed in range(60):
         asked_ms, ranging = 235, [(ms, 1, b"C05|2|1|1|0\r") for ms in range(10, 400, 60)]
@@ -152,7 +152,7 @@ def test_passive_boards_answer_late_where_frames_are_lost():
 
 
 def places(positions_m):
-    """Boards on a line, 1 at the first place."""
+    """Return boards on a line, board 1 at the first position."""
     named = dict(enumerate(positions_m, 1))
     return Scenario.model_validate(
         {
@@ -170,17 +170,17 @@ def places(positions_m):
 @pytest.mark.parametrize(
     ("other_m", "lag_us", "received"),
     [
-        (3.0, 50, None),  # 2 m and 1 m away: the second is the stronger, and spoils the first
-        (5.9, 50, None),  # 3.9 m, 5.8 dB weaker: too little
+        (3.0, 50, None),  # 2 m and 1 m away: the second is stronger, and destroys the first
+        (5.9, 50, None),  # 3.9 m, 5.8 dB weaker: not enough
         (6.1, 50, 1),  # 4.1 m, 6.2 dB weaker: captured
-        (6.1, -50, None),  # the weaker one came first, and the receiver is locked to it
-        (900.0, -50, 1),  # too far to be heard at all
+        (6.1, -50, None),  # the weaker one was first, and the receiver is locked to it
+        (900.0, -50, 1),  # too far to be received at all
     ],
 )
 def test_of_two_frames_at_once_the_first_is_received_where_it_is_stronger_by_the_capture_ratio(
     other_m, lag_us, received
 ):
-    """Board 1 polls board 2, two metres away, and board 3 polls board 4 a little later or earlier."""
+    """Board 1 polls board 2, two metres away, and board 3 polls board 4 slightly later or earlier."""
     bench = VirtualPorts(places([0.0, 2.0, other_m, other_m + 2])).bench
     came: list[Received | None] = []
     bench.boards[2].radio._interrupt = came.append

@@ -1,4 +1,4 @@
-"""The existing client library's habits: boards that stand in for real ones must be kind to them.
+"""Compatibility with the existing client library, which expects the timing of real boards.
 
 It keeps no bytes between two reads, scans ids 0 to 10, and takes one line with a time-out at each call.
 """
@@ -16,11 +16,11 @@ from uwblink.wire.messages import REPORTS
 
 TIMEOUT_S = 0.1
 LATENCY_S = (0.0002, 0.0015)
-"""From the end of a line to the client's next look at its port: an operating system and an interpreter."""
+"""Time from the end of a line to the next read by the client: of an operating system and an interpreter."""
 
 
 class Client:
-    """A client that forgets: each call takes a line and whatever else has come by then, and no more is kept."""
+    """A client without a buffer: each call takes a line and all other bytes that have arrived, and discards them."""
 
     def __init__(self, transport, seed):
         self.transport, self.came, self.random = transport, b"", random.Random(seed)
@@ -34,7 +34,7 @@ class Client:
             self.came += self.transport.read(left)
 
     def messages(self, timeout_s=TIMEOUT_S):
-        """What one call finds: a line, or what came before the time was over, and what else waits then."""
+        """Return the result of one call: a line, or the bytes until the time-out, and the other waiting bytes."""
         until = self.transport.now_s() + timeout_s
         while b"\r\n" not in self.came and (left := until - self.transport.now_s()) > 0:
             self.came += self.transport.read(left)
@@ -49,7 +49,7 @@ class Client:
 
 @pytest.fixture(params=["virtual", "real"])
 def clients(request):
-    """Two clients, the initiator first; test_boards.py has what a terminal does to bytes."""
+    """Two clients, the initiator first; test_boards.py tests the effects of a terminal on bytes."""
     with two_ports(request.param) as (ports, _):
         yield [Client(port, seed) for seed, port in enumerate(ports, 1)]
 
@@ -60,7 +60,7 @@ def board_id(client):
 
 @pytest.mark.slow
 def test_nine_of_ten_impulse_responses_reach_both_ends(clients):
-    """The firmware's own boards: 91 of 100."""
+    """Real boards with the firmware: 91 of 100."""
     one, two = clients
     target = board_id(two)
     got = {one: 0, two: 0}
@@ -78,7 +78,7 @@ def test_nine_of_ten_impulse_responses_reach_both_ends(clients):
     assert min(got.values()) >= 90, got.values()
 
 
-def test_a_scan_of_ids_finds_who_is_there(clients):
+def test_a_scan_of_ids_finds_the_boards(clients):
     one, two = clients
     mine, other = board_id(one), board_id(two)
     found = []

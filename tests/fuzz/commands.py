@@ -1,8 +1,8 @@
-"""Damaged files of every kind, and hostile options, through every command: `python -m tests.fuzz.commands`.
+"""Damaged files of every kind, and hostile options, with every command: `python -m tests.fuzz.commands`.
 
-A case is a number: it says which kind of file is damaged how, and which command takes it, the same on every machine.
-What must not happen: an exception that nobody caught, a warning of NumPy, more than 20 s of the processor, more than
-2 GB, a status that is not 0, 1 or 2, an error of several lines, and an output beside an error.
+A case is a number that determines the kind of file, its damage and the command, equally on every machine. Failures are:
+an uncaught exception, a warning of NumPy, more than 20 s of processor time, more than 2 GB, a status other than 0, 1 or
+2, an error of several lines, and an output in spite of an error.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from tests.fuzz.options import another_option
 from tests.fuzz.seeds import ALONE, KINDS, SELDOM, Kind, write_seeds
 
 LIMITS: Final = {resource.RLIMIT_DATA: 2_000_000_000, resource.RLIMIT_CPU: 20}
-"""Bytes of memory and seconds of the processor that a command may take."""
+"""Limits of memory in bytes and of processor time in seconds of a command."""
 
 LONGEST_WAIT_S: Final = 300.0
 TOLD_EVERY: Final = 1000
 OPTIONS_SHARE: Final = 0.1
-"""Share of cases in which an option is damaged and not the file."""
+"""Share of cases in which an option is damaged instead of the file."""
 
 ANOTHER_SHARE: Final = 0.5
-"""Share of these in which it is an option more."""
+"""Share of these in which an option is added."""
 
 
 def kind_of(rng: random.Random) -> Kind:
@@ -43,7 +43,7 @@ def kind_of(rng: random.Random) -> Kind:
 
 
 def words_of(kind: Kind, damaged: Path, seeds: Path, out: Path, rng: random.Random) -> list[str]:
-    """Return the words of one of a kind's commands."""
+    """Return the words of one of the commands of a kind."""
     seldom = kind.seldom and rng.randrange(SELDOM) == 0
     place = {"{}": str(damaged), "{folder}": str(damaged.parent), "{out}": str(out)}
     return [_filled(word, place, seeds) for word in shlex.split(rng.choice(kind.seldom if seldom else kind.commands))]
@@ -57,12 +57,12 @@ def _filled(word: str, place: dict[str, str], seeds: Path) -> str:
 
 
 def _argument(word: str) -> str:
-    """Return a word as it can be given to a command: without NUL and half characters."""
+    """Return a word that is possible as an argument of a command: without NUL and lone surrogates."""
     return word.replace("\x00", "").encode("utf-8", "replace").decode()
 
 
 def damage_options(words: list[str], seeds: Path, rng: random.Random) -> list[str]:
-    """Change, drop or double one of a command's words after the first two, or add an option that it has."""
+    """Change, remove or repeat one of the words of a command after the first two, or add one of its options."""
     if rng.random() < ANOTHER_SHARE:
         return [*words, *(_argument(_filled(word, {}, seeds)) for word in another_option(words, rng))]
     place = rng.randint(2, len(words))
@@ -72,11 +72,11 @@ def damage_options(words: list[str], seeds: Path, rng: random.Random) -> list[st
 
 
 def prepare(number: int, seeds: Path, place: Path) -> list[str]:
-    """Damage what case `number` damages, in `place`; returns the words of its command."""
+    """Make the damage of case `number` in `place`; return the words of its command."""
     rng = random.Random(number)
     kind = kind_of(rng)
     damaged = place / kind.file
-    shutil.copyfile(seeds / "scenario.toml", place / "scenario.toml")  # which a plan names
+    shutil.copyfile(seeds / "scenario.toml", place / "scenario.toml")  # because a plan names it
     if damaged.parent != place:
         shutil.copytree((seeds / kind.file).parent, damaged.parent)
     if kind.commands is ALONE or rng.random() < OPTIONS_SHARE:
@@ -91,7 +91,7 @@ def prepare(number: int, seeds: Path, place: Path) -> list[str]:
 
 
 def judge(ended: subprocess.CompletedProcess[str], written: list[Path]) -> str:
-    """Return what is wrong with how a command ended; nothing where it ended well."""
+    """Return a text on a failure of a command that has ended; "" if there is none."""
     if ended.returncode < 0:
         return f"died of signal {-ended.returncode}"
     if "Traceback (most recent call last)" in ended.stderr:
@@ -110,12 +110,12 @@ def judge(ended: subprocess.CompletedProcess[str], written: list[Path]) -> str:
 
 
 def run_case(number: int, seeds: Path, folder: Path) -> tuple[str, int | None]:
-    """Try a case; returns what is wrong, or nothing, and the command's status."""
+    """Run a case; return a text on its failure, or "", and the status of the command."""
     place = folder / str(number)
     place.mkdir()
     words = prepare(number, seeds, place)
     try:
-        # Its own folder is the working folder: a hostile word may be the name of an output.
+        # The working folder is its own folder, because a hostile word may be the name of an output.
         ended = processes.run(*words, cwd=place, timeout=LONGEST_WAIT_S, limits=LIMITS)
     except subprocess.TimeoutExpired:
         return f"waits for ever   [{' '.join(words)[:150]}]", None
@@ -126,7 +126,7 @@ def run_case(number: int, seeds: Path, folder: Path) -> tuple[str, int | None]:
 
 
 def main() -> int:
-    """Try cases and print what is wrong; status 1 where anything is."""
+    """Run cases and print failures; status 1 if there are any."""
     parser = argparse.ArgumentParser(description="Run commands on damaged files.")
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--cases", type=int, default=2000)

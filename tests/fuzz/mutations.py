@@ -1,7 +1,7 @@
 """Ways to damage a file: bytes, lines, numbers, values of JSON, cells and tables of a recording.
 
-Each takes the content of a sound file and a random generator, and returns a damaged one, or None where it finds
-nothing to damage.
+Each takes the content of a sound file and a random generator, and returns a damaged one, or None if it finds nothing to
+damage.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ def flip(data: bytes, rng: random.Random) -> bytes | None:
 
 
 def cut(data: bytes, rng: random.Random) -> bytes | None:
-    """End the file early."""
+    """Truncate the file."""
     return data[: rng.randrange(len(data))] if data else None
 
 
 def number(data: bytes, rng: random.Random) -> bytes | None:
-    """Put another number, or none, in place of one."""
+    """Replace a number by another, or remove it."""
     found = list(NUMBER.finditer(data))
     if not found:
         return None
@@ -59,7 +59,7 @@ def number(data: bytes, rng: random.Random) -> bytes | None:
 
 
 def line(data: bytes, rng: random.Random) -> bytes | None:
-    """Leave a line out, double it, or move it."""
+    """Remove a line, repeat it, or move it."""
     lines = data.split(b"\n")
     taken = lines.pop(rng.randrange(len(lines)))
     for _ in range(rng.randint(0, 2)):
@@ -68,7 +68,7 @@ def line(data: bytes, rng: random.Random) -> bytes | None:
 
 
 def word(data: bytes, rng: random.Random) -> bytes | None:
-    """Put a hostile word in place of a word, or somewhere."""
+    """Replace a word by a hostile word, or insert one."""
     found = list(re.finditer(rb"[A-Za-z_]{2,}", data))
     hostile = rng.choice(WORDS).encode("utf-8", "surrogatepass")
     if not found:
@@ -78,7 +78,7 @@ def word(data: bytes, rng: random.Random) -> bytes | None:
 
 
 def splice(data: bytes, rng: random.Random) -> bytes | None:
-    """Put a piece of the file somewhere else in it, once or a thousand times."""
+    """Insert a piece of the file at another place, once or a thousand times."""
     if not data:
         return None
     start = rng.randrange(len(data))
@@ -107,7 +107,7 @@ def leaf(data: bytes, rng: random.Random) -> bytes | None:
 
 
 def nest(data: bytes, rng: random.Random) -> bytes | None:
-    """Nest a document, or what stands for it, a thousand or a hundred thousand times."""
+    """Nest a document, or a text that looks like one, a thousand or a hundred thousand times."""
     depth = rng.choice((1000, 100_000))
     return b"[" * depth + data + b"]" * depth
 
@@ -118,9 +118,9 @@ BINARY: Final[tuple[Mutation, ...]] = (flip, cut, splice)
 
 
 def damage_recording(source: Path, target: Path, rng: random.Random) -> None:
-    """Write a copy of a recording with one to three cells, columns, rows, tables or entries of `meta` changed.
+    """Write a copy of a recording with one to three changes of cells, columns, rows, tables or entries of `meta`.
 
-    What the database itself refuses stays as it is.
+    Changes that the database refuses are left out.
     """
     shutil.copyfile(source, target)
     with duckdb.connect(str(target)) as db:

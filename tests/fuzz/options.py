@@ -1,4 +1,4 @@
-"""Options as the commands have them today: their names, and values that fit and that do not."""
+"""Options of the present commands: their names, and values that fit and that do not."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.fuzz.mutations import WORDS
 
 PACKAGES: Final = ("uwblink", "uwbsim", "calib")
 NEVER: Final = frozenset({"--help", "--scheduler", "--foxglove", "--udp", "--serve", "--speed", "--duration", "--live"})
-"""Options that wait for others, or for as long as they are told."""
+"""Options that wait for other processes, or for a given time."""
 
 NUMBERS: Final = ("0", "1", "3", "-1", "0.5", "1e-9", "1e300", "nan", "inf", "-inf", "9" * 30)
 PLAIN: Final = (
@@ -25,19 +25,19 @@ PLAIN: Final = (
 
 @functools.cache
 def commands() -> Mapping[str, Any]:
-    """Return every command that does something, by the words that call it."""
+    """Return every command without sub-commands, by the words that call it."""
     apps = {package: importlib.import_module(f"{package}.cli.commands").app for package in PACKAGES}
     found = {name: leaves(typer.main.get_command(app), (name,)) for name, app in apps.items()}
     return {" ".join(words): command for some in found.values() for words, command in some}
 
 
 def command_of(words: Sequence[str]) -> str:
-    """Return the words that call the command of a line, as `calib fit`."""
+    """Return the words that call the command of a line, such as `calib fit`."""
     return next(name for name in (" ".join(words[:3]), " ".join(words[:2])) if name in commands())
 
 
 def another_option(words: Sequence[str], rng: random.Random) -> list[str]:
-    """Return an option that a command has, and a value where it takes one."""
+    """Return an option of a command, and a value if it takes one."""
     try:
         known = commands()[command_of(words)]
     except StopIteration:

@@ -1,4 +1,4 @@
-"""Sound files of every kind that commands take, and the commands that take them."""
+"""Sound files of every kind that commands read, and the commands that read them."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ GUESS: Final = "uwblink import guess {} -o {out}"
 
 
 class Kind(NamedTuple):
-    """A kind of file: its place in the folder of seeds, share, what damages it, and commands with `{}` in its place.
+    """A kind of file: its place in the folder of seeds, its share, mutations, and commands with `{}` in its place.
 
-    `{folder}` is the folder that the file is in, `{out}` an output that is not there, `{name}` any other seed. What
-    takes longer, as pages with figures do, is drawn once in `SELDOM` times.
+    `{folder}` is the folder of the file, `{out}` an output that does not exist, `{name}` any other seed. Commands that
+    take longer, such as pages with figures, are drawn once in `SELDOM` times.
     """
 
     file: str
@@ -108,7 +108,7 @@ ALONE: Final = (
     "calib fit {flight.uwb} -o {out} --fix 1=-0.36 --reference-power -82 --scale 0.1",
     "calib fit {flight.uwb} -o {out} --truth ranges --poses-until 1 --attitudes none --heading-std 3",
 )
-"""Commands of which options alone are damaged."""
+"""Commands of which only options are damaged."""
 
 KINDS: Final = (
     Kind("flight.uwb", 12, (), RECORDING_COMMANDS, RECORDING_PAGES),
@@ -184,7 +184,7 @@ KINDS: Final = (
 
 
 def write_seeds(folder: Path) -> None:
-    """Write a small sound file of every kind into a folder: a case should take hundredths of a second."""
+    """Write a small sound file of every kind into a folder, so that a case takes hundredths of a second."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in (
         ("map.toml", MAP), ("known.toml", KNOWN), ("groups.toml", GROUPS), ("plan.toml", PLAN), ("nothing", ""),
@@ -197,7 +197,7 @@ def write_seeds(folder: Path) -> None:
 
 
 def _write_flights(folder: Path) -> None:
-    """Write a scenario, what was recorded in it, and calibrations from that."""
+    """Write a scenario, a recording of it, and calibrations from that."""
     scenario = (ROOT / SCENARIO).read_text()
     (folder / "scenario.toml").write_text(scenario.replace("duration_s = 60.0", "duration_s = 1.5"))
     simulated = uwbsim.simulate(folder / "scenario.toml")
@@ -237,7 +237,7 @@ def _write_tables(folder: Path) -> None:
 
 
 def _write_forms(folder: Path) -> None:
-    """Write files of other forms, and their maps, as the tests of these make them."""
+    """Write files of other forms, and their maps, as the tests of these forms do."""
     constants = "[constants]\nfrom_id = 7\n"
     test_forms.table(folder / "form_wide.csv", test_forms.wide_rows("r_AN{}"))
     (folder / "form_wide.toml").write_text('missing = [-1, "x"]\n[columns]\ntime_s = "t_s"\nfrom_id = "tag"\n' + WIDE)

@@ -1,4 +1,4 @@
-"""The whole loop on the icra2023 scenarios: simulate, fit, evaluate, and find what was planted."""
+"""The whole loop on the icra2023 scenarios: simulate, fit, evaluate, and compare with the planted values."""
 
 import itertools
 import json
@@ -44,11 +44,11 @@ def planted(flights):
 
 
 def common_shift_ns(calibration, planted):
-    """A constant in the curve and a shift common to all delays are one thing: see theory.md."""
+    """Return the shift common to all delays, which has the same effect as a constant of the curve (see theory.md)."""
     return np.mean([calibration.delays_ns[int(t)] - d for t, d in planted["delays_ns"].items()])
 
 
-def test_the_flights_have_the_size_the_issue_of_the_paper_has(flights):
+def test_flights_have_the_size_of_those_of_the_paper(flights):
     sizes = {name: len(load_ranges(flights / f"{name}.uwb")) for name in ("train", "test1", "test2")}
     assert 36_000 < sizes["train"] < 40_000
     assert 9_000 < sizes["test1"] < 11_000
@@ -58,7 +58,7 @@ def test_the_flights_have_the_size_the_issue_of_the_paper_has(flights):
 def test_raw_errors_resemble_the_paper(flights):
     tests = concatenate([load_ranges(flights / "test1.uwb"), load_ranges(flights / "test2.uwb")])
     error = tests.raw_m - tests.truth_m
-    # ICRA 2023 reports 11.1 cm and 19.0 cm on its own tests; 2 cm is the spread between flights.
+    # ICRA 2023 reports 11.1 cm and 19.0 cm for its own tests; the spread between flights is 2 cm.
     assert np.mean(error) == pytest.approx(0.111, abs=0.02)
     assert np.std(error) == pytest.approx(0.190, abs=0.02)
     assert np.mean(((error - np.mean(error)) / np.std(error)) ** 3) > 1, "the tail is positive"
@@ -83,7 +83,7 @@ def test_planted_bias_curve_is_found_within_5_mm_rms(flights, calibration, plant
     assert np.sqrt(np.mean((fitted - shift_m - truth) ** 2)) < 0.005
 
 
-def test_each_stage_of_the_recipe_is_better_than_the_one_before(flights, tmp_path):
+def test_each_stage_of_the_recipe_reduces_the_errors(flights, tmp_path):
     recipe = tmp_path / "sequential.json"
     run("calib", "fit", flights / "train.uwb", "-o", recipe, "--sequential")
     for name in ("test1", "test2"):
@@ -92,7 +92,7 @@ def test_each_stage_of_the_recipe_is_better_than_the_one_before(flights, tmp_pat
             text = run("calib", "evaluate", flights / f"{name}.uwb", "-c", calibration, "--json")
             overall = json.loads(text)["overall"]
             mean[calibration] = {stage: abs(overall[stage]["mean_m"]) for stage in ("raw", "delays", "full")}
-        # The delays of a joint fit are those at one power, so only the recipe's mean something without a curve.
+        # The delays of a joint fit refer to one power, so only those of the recipe can be used without a curve.
         assert mean[recipe]["raw"] > mean[recipe]["delays"]
         assert mean[recipe]["raw"] > mean[recipe]["full"]
         joint = mean[flights / "calibration.json"]
@@ -117,19 +117,19 @@ def test_fit_does_not_read_what_was_planted(flights, tmp_path):
 
 
 def test_powers_and_errors_by_power_are_those_of_the_papers_samples(flights, planted):
-    """The samples are of half of the paper's training flight, after antenna delays and the rejection of outliers.
+    """The samples are half of the paper's training flight, after antenna delays and the rejection of outliers.
 
-    Here delays are taken out as planted, and what is further off than 3.9 standard deviations at its power, as there.
+    Here planted delays are removed, and errors beyond 3.9 standard deviations at their power, as there.
     """
     lifted, bias = np.loadtxt(shared("icra2023_bias_fpp.csv"), delimiter=",", skiprows=1).T
     r = load_ranges(flights / "train.uwb")
     delay = np.array([planted["delays_ns"].get(str(tag), 0.0) for tag in range(7)]) * 1e-9
     weighted = r.weight_initiator * delay[r.initiator] + r.weight_target * delay[r.target]
     error, mine = r.raw_m + SPEED_OF_LIGHT * weighted - r.truth_m, lift(r)
-    # Flights are of other rooms and minutes: 2 % of lifted power in the bulk, 5 % at the ends.
+    # Flights differ in rooms and durations: 2 % of lifted power in the bulk, 5 % at the ends.
     np.testing.assert_allclose(np.quantile(mine, [0.05, 0.5, 0.95]), np.quantile(lifted, [0.05, 0.5, 0.95]), atol=0.06)
     assert mine.max() < 1.6
-    # One tail at all powers here, where theirs is heavier in the middle (skewness 1.3) than at the ends (0.2).
+    # Here all powers have one tail; in the samples it is heavier in the middle (skewness 1.3) than at the ends (0.2).
     edges = np.quantile(lifted, np.linspace(0, 1, 7))
     for low, high in itertools.pairwise(edges):
         theirs = bias[(lifted >= low) & (lifted < high)]
@@ -148,10 +148,10 @@ def clipped(error):
     return error
 
 
-# Eight seeds of the training flight, a twelfth as long: errors and intervals. `make accuracy` runs two hundred.
+# Eight seeds of the training flight, with a twelfth of its duration: errors and intervals. `make accuracy` runs 200.
 
 
-# Other seeds for each share of reflections, so that their noise is not the same.
+# Other seeds for each share of reflections, for other noise.
 SEEDS = {0.1: range(201, 209), 0.3: range(301, 309)}
 
 
@@ -162,7 +162,7 @@ def outcomes():
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_delays_are_found_at_ten_and_thirty_per_cent_of_reflections(outcomes, loss):
-    # A twelfth of the data allows 3.5 times as much as the whole flight: 10 ps at 10 %, 20 ps at 30 %.
+    # A twelfth of the data allows 3.5 times the error of the whole flight: 10 ps at 10 %, 20 ps at 30 %.
     for share, bound_ps in ((0.1, 35), (0.3, 70)):
         assert np.median([run[loss].delays_ps for run in outcomes[share]]) < bound_ps
 
@@ -170,15 +170,15 @@ def test_delays_are_found_at_ten_and_thirty_per_cent_of_reflections(outcomes, lo
 @pytest.mark.parametrize("loss", LOSSES)
 def test_intervals_hold(outcomes, loss):
     scores = np.abs([run[loss].scores for runs in outcomes.values() for run in runs]).ravel()
-    # 96 scores, of which five in six are free, know a share of 95 % to 2.4 %: two and a half of those below. Two
-    # hundred seeds of the whole flight are in docs/accuracy.md, and hold it to a per cent.
+    # 96 scores, of which five in six are independent, determine a share of 95 % to 2.4 %: two and a half of those
+    # below. Two hundred seeds of the whole flight are in docs/accuracy.md, and determine it to a per cent.
     assert np.mean(scores < 1.959964) > 0.89
     assert np.std(np.concatenate([run[loss].scores for runs in outcomes.values() for run in runs])) > 0.8
 
 
 @pytest.mark.parametrize(("loss", "bound_mm"), [("cauchy", 24), ("mixture", 9)])
 def test_the_curve_is_found(outcomes, loss, bound_mm):
-    # 3.5 times the bounds of the whole flight (7 and 2.5 mm), for a twelfth of it. Cauchy's loss, which nothing centres
-    # any more, leaves some millimetres of the reflections' tail in the constant.
+    # 3.5 times the bounds of the whole flight (7 and 2.5 mm), for a twelfth of it. The Cauchy loss leaves some
+    # millimetres of the tail of reflections in the constant.
     for runs in outcomes.values():
         assert np.median([run[loss].curve_mm for run in runs]) < bound_mm

@@ -1,4 +1,4 @@
-"""Boards are recorded, calibrated, programmed, and recorded again: what is programmed is told and counted once."""
+"""Boards are recorded, calibrated, programmed, and recorded again: programmed delays are known and counted once."""
 
 import json
 import tomllib
@@ -24,7 +24,7 @@ PLACES_M = {1: (0.0, 0.0, 1.0), 2: (4.0, 0.0, 1.6), 3: (0.5, 3.5, 0.7), 4: (4.2,
 
 
 def scenario(delays_ns, noise_ps=30.0, protocol="ds"):
-    """Boards that stand still, with clocks that run alike."""
+    """Return boards that stand still, with equal clock rates."""
     bodies = "".join(
         f"[[bodies]]\nname = 'b{tag}'\nmotion = {{ model = 'static', position_m = {list(PLACES_M[tag])} }}\n"
         f"[[tags]]\nid = {tag}\nbody = 'b{tag}'\ndelay_ns = {delay}\n"
@@ -41,13 +41,13 @@ def programmed(world, path):
 
 
 def record(world, path, delays=None, protocol="ss", said=True, duration_s=2.0):
-    """Record virtual boards into which a file of antenna delays is programmed, with their poses."""
+    """Record virtual boards with programmed antenna delays of a file, and their poses."""
     ports = uwbsim.VirtualPorts(programmed(world, delays))
     told = load_antenna_delays(delays) if delays and said else {}
     tags = tuple(uwblink.Tag(tag, f"b{tag}", (0.0, 0.0, 0.0)) for tag in PLACES_M)
     plan = uwblink.RangingPlan(rate_hz=200.0, protocol=protocol, tags=tags, antenna_delays=told)
     uwblink.record(ports.names.values(), path, plan, duration_s=duration_s, using=ports)
-    # Boards stand still: a pose each will do.
+    # Boards stand still: one pose each is enough.
     rows = [f"0,b{tag},{x},{y},{z},0,0,0,1" for tag, (x, y, z) in PLACES_M.items()]
     path.with_suffix(".csv").write_text("\n".join(["time_ns,body,x,y,z,qx,qy,qz,qw", *rows]))
     add_poses(path, path.with_suffix(".csv"))
@@ -60,13 +60,13 @@ def exported(calibration, to, path):
 
 
 def totals(path):
-    """What is programmed in all, by tag, read without any code of the packages."""
+    """Return the sum of the programmed delays by tag, read without code of the packages."""
     tags = tomllib.loads(path.read_text())["antenna_delays"]["tags"]
     return {int(tag): one["tx"] + one["rx"] for tag, one in tags.items()}
 
 
 def errors_cm(path):
-    """Mean error of each pair's ranges as the boards print them, by the places where they stand."""
+    """Return the mean error of each pair's printed ranges, from the positions of the boards."""
     found = uwblink.load(path).exchanges
     by_pair = {}
     for a, b in combinations(PLACES_M, 2):
@@ -91,7 +91,7 @@ def loop(tmp_path_factory):
     return folder
 
 
-def test_what_was_programmed_comes_out_again(loop):
+def test_programmed_delays_are_found_again(loop):
     once, again = totals(loop / "firmware.toml"), totals(loop / "second.toml")
     for tag, delay in DELAYS_NS.items():
         assert once[tag] - 2 * 16436 == pytest.approx(-delay * 1e-9 / TICK_S, abs=1.5)
@@ -104,8 +104,8 @@ def test_what_was_programmed_comes_out_again(loop):
     assert by_base.stdout == (loop / "second.toml").read_text()
 
 
-def test_registers_alone_leave_the_constant_of_delayed_replies(loop):
-    """The target's own stamp has a constant of the firmware's build, by which single-sided ranges are wrong."""
+def test_registers_do_not_change_the_constant_of_delayed_replies(loop):
+    """The target's own stamp has a constant of the firmware's build, which causes errors of single-sided ranges."""
     record(scenario(DELAYS_NS), loop / "registers.uwb", loop / "registers.toml")
     before, alone, with_constant = (errors_cm(loop / f"{name}.uwb") for name in ("first", "registers", "second"))
     assert max(map(abs, before.values())) > 5
@@ -129,7 +129,7 @@ def test_registers_alone_leave_the_constant_of_delayed_replies(loop):
     ],
 )
 def test_stamps_are_those_of_the_firmware(tmp_path, protocol, through):
-    """Registers go into the chip's stamps, the constant into those of delayed replies; by ticks, without noise."""
+    """Registers change the stamps of the chip, the constant those of delayed replies; by ticks, without noise."""
     rows = {1: (16446, 16449, 16436), 2: (16430, 16400, 16441), 3: (16436, 16436, 16436), 4: (17000, 15880, 17000)}
     text = "".join(f"[antenna_delays.tags.{t}]\ntx = {a}\nrx = {b}\nreply = {c}\n" for t, (a, b, c) in rows.items())
     (tmp_path / "d.toml").write_text(text)
@@ -164,7 +164,7 @@ def test_stamps_are_those_of_the_firmware(tmp_path, protocol, through):
         assert abs(left_m[(i == a) & (j == b)].mean()) < 2.4e-3
 
 
-def test_programmed_boards_are_not_recorded_as_if_they_were_not(loop, tmp_path):
+def test_recordings_require_the_programmed_delays(loop, tmp_path):
     world = scenario(DELAYS_NS)
     with pytest.raises(PlanError, match=r"board 1.*16436"):
         record(world, tmp_path / "f.uwb", loop / "firmware.toml", said=False)
@@ -178,7 +178,7 @@ def test_programmed_boards_are_not_recorded_as_if_they_were_not(loop, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_calibration_of_other_delays_is_told_wherever_it_is_used(loop, tmp_path):
+def test_calibrations_with_other_programmed_delays_have_warnings(loop, tmp_path):
     second, first = loop / "second.uwb", loop / "first.json"
     for words in (
         ("calib", "evaluate", second, "-c", first),
@@ -196,7 +196,7 @@ def test_a_calibration_of_other_delays_is_told_wherever_it_is_used(loop, tmp_pat
         calib.load_ranges([loop / "first.uwb", second])
 
 
-def test_where_nothing_says_what_was_programmed_no_register_is_guessed(tmp_path):
+def test_unknown_programmed_delays_give_no_registers(tmp_path):
     known = calib.fit(replace(calib.load_ranges(calib.sample_flight()), antenna_delays={})).calibration
     known.save(tmp_path / "c.json")
     refuse("calib", "export", tmp_path / "c.json", "--to", "registers", naming=["--antenna-delays"])
@@ -209,7 +209,7 @@ def test_where_nothing_says_what_was_programmed_no_register_is_guessed(tmp_path)
     assert all(row["reply"] == row["tx"] for row in rows.values())
 
 
-def test_a_flight_into_whose_tags_something_was_programmed_has_the_planted_delays_of_that(loop, tmp_path):
+def test_simulated_flights_with_programmed_delays_have_the_planted_ones(loop, tmp_path):
     words = ("uwbsim", "run", "noiseless", "--set", "run.duration_s=10")
     succeed(*words, "-o", tmp_path / "a.uwb")
     rows = {tag: (16440 + tag, 16450 - 2 * tag) for tag in range(1, 7)}

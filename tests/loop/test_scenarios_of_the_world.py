@@ -1,4 +1,4 @@
-"""Scenarios whose outcome is known beforehand: a month later, anchors, two tags, an office."""
+"""Scenarios with known results: a month later, anchors, two tags, an office."""
 
 import re
 
@@ -42,7 +42,7 @@ def delays(calibration):
 @pytest.mark.slow
 def test_a_month_later_the_delays_are_the_same(tmp_path):
     then, now = (fit(ranges(tmp_path, name)).calibration for name in ("icra2023/train.toml", "day30/train.toml"))
-    # Each fit knows a delay to 8 ps; 30 ps are 2.7 standard errors of a difference, for six of them.
+    # Each fit determines a delay to 8 ps; 30 ps are 2.7 standard errors of a difference, for six of them.
     assert np.abs(delays(then) - delays(now)).max() < 0.030
 
 
@@ -55,12 +55,12 @@ def test_anchors_that_range_with_each_other_are_determined(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["anchors_and_tag/bipartite.toml", "new_tag/new_tag.toml"])
-def test_of_two_groups_the_sums_are_determined(tmp_path, name):
+def test_sums_of_delays_of_two_groups_are_determined(tmp_path, name):
     r = ranges(tmp_path, name)
     found = fit(r).calibration
     assert len(found.undetermined_splits) == 1
     planted = {pair: sum(r.planted["delays_ns"][str(tag)] for tag in pair) for pair in found.pair_constants}
-    # The curve that was planted is not zero at the reference power, and adds a constant to all.
+    # The planted curve is not zero at the reference power, and adds a constant to all.
     away = {pair: one.offset_m + 0.5e-9 * SPEED_OF_LIGHT * planted[pair] for pair, one in found.pair_constants.items()}
     assert np.ptp(list(away.values())) < 5 * max(one.std_m for one in found.pair_constants.values()) < 0.06
 
@@ -84,19 +84,21 @@ def test_obstacles_and_echoes_lengthen_ranges(tmp_path):
     ],
 )
 def test_calibrated_is_never_worse_than_raw(tmp_path, name, settings):
-    """Fitted on one half of a flight and judged on the other, powers beyond the fitted range included."""
+    """Fitted on one half of a flight and evaluated on the other, including powers outside the fitted range."""
     r = ranges(tmp_path, name, *settings)
     half = np.median(r.time_ns)
     overall = evaluate(r[r.time_ns >= half], fit(r[r.time_ns < half]).calibration).overall
-    # What is known to 2 mm cannot be told apart where nothing is wrong with raw ranges.
+    # If raw ranges have no error, differences below 2 mm are not significant.
     assert abs(overall.full.mean_m) < abs(overall.raw.mean_m) + 0.002
     assert overall.full.std_m < overall.raw.std_m + 0.002
     assert overall.full.robust_std_m < overall.raw.robust_std_m + 0.002
 
 
 @pytest.mark.parametrize("reply_uus", [300, 1500])
-def test_the_true_delays_leave_nothing_at_either_reply(tmp_path, reply_uus):
-    """rx3 is the initiator's stamp; corrected as the target's, pairs would differ by centimetres at dt53 = 0.3 ms."""
+def test_true_delays_correct_ranges_with_both_replies(tmp_path, reply_uus):
+    """rx3 is a stamp of the initiator; if it were corrected as one of the target, pairs would differ by centimetres at
+    dt53 = 0.3 ms.
+    """
     r = ranges(tmp_path, "noiseless.toml", f"ranging.response_delay_uus={reply_uus}")
     planted = {int(tag): delay for tag, delay in r.planted["delays_ns"].items()}
     delay = np.array([planted.get(tag, 0.0) for tag in range(7)])
@@ -107,21 +109,22 @@ def test_the_true_delays_leave_nothing_at_either_reply(tmp_path, reply_uus):
 
 
 @pytest.mark.slow
-def test_a_fit_of_boards_that_warm_up_says_that_delays_moved(tmp_path):
-    """Ranges grow by 2.15 mm/K for each of two tags, and shrink by 5.35 cm/V as batteries sag."""
+def test_a_fit_of_boards_that_warm_up_has_a_warning(tmp_path):
+    """Ranges grow by 2.15 mm/K for each of two tags, and shrink by 5.35 cm/V as batteries discharge."""
     path = tmp_path / "warm.uwb"
     simulate(load(SCENARIOS / "warm_up" / "warm_up.toml"), contention=False).save(path)
     r = load_ranges(path)
     error, time_s = r.raw_m - r.truth_m, r.time_ns * 1e-9
     grown = np.mean(error[time_s > 220]) - np.mean(error[time_s < 20])
-    # From the first 20 s to the last boards gain 16.6, 14.7 and 13.3 K and lose 73 mV; other places add up to 1 cm.
+    # From the first 20 s to the last, boards warm by 16.6, 14.7 and 13.3 K and lose 73 mV; other positions add up to 1
+    # cm.
     assert grown == pytest.approx(2 * (2.15e-3 * 14.9 - 0.0535 * 0.073), abs=0.012)
     assert any("part of the recording" in warning for warning in fit(r, temperature="none").warnings)
-    # What the boards read explains it: 2.15 mm/K less 5.35 cm/V times 73 mV over 14.9 K.
+    # The readings of the boards explain it: 2.15 mm/K minus 5.35 cm/V times 73 mV over 14.9 K.
     (slope,) = (found := fit(r)).calibration.temperatures
     assert slope.m_per_k == pytest.approx(2.15e-3 - 0.0535 * 0.073 / 14.9, abs=2e-4)
     assert not any("part of the recording" in warning for warning in found.warnings)
-    # Least squares over the readings, which have noise: the supply falls by 73 mV where boards gain 14.9 K.
+    # Least squares over noisy readings: the supply falls by 73 mV while boards warm by 14.9 K.
     (said,) = [warning for warning in found.warnings if "supply" in warning]
     per_k = float(re.search(r"changes by (-[\d.]+) mV/K", said)[1])
     assert per_k == pytest.approx(-73 / 14.9, rel=0.15)
@@ -129,29 +132,29 @@ def test_a_fit_of_boards_that_warm_up_says_that_delays_moved(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_calibration_holds_less_where_boards_are_mounted_differently(tmp_path):
+def test_a_calibration_is_less_accurate_for_other_mountings(tmp_path):
     before, after = (ranges(tmp_path, f"mounted_differently/{day}.toml") for day in ("before", "after"))
     calibration = fit(before).calibration
     off = [max(abs(pair.accepted.mean_m) for pair in evaluate(r, calibration).pairs.values()) for r in (before, after)]
-    # 800 ranges with 3 cm of noise know a pair's mean to 1 mm; antennas differ by 2 cm over direction.
+    # 800 ranges with 3 cm of noise determine the mean of a pair to 1 mm; antennas differ by 2 cm over direction.
     assert off[0] < 0.004 < off[1] < 0.03
 
 
-# Ranges that went by a detour, in rooms that no calibration has seen and in a real flight.
+# Reflected ranges, in rooms that were not fitted and in a real flight.
 
 
 @pytest.mark.slow
-def test_reflections_are_told_in_rooms_that_were_not_fitted():
+def test_reflections_are_detected_in_unfitted_rooms():
     rooms = [of_room(seed, 10.0) for seed in range(420, 428)]
     told = Told.left_out(rooms)
-    # Of 800 long ranges an area is known to 0.01, but they come from eight rooms only.
+    # 800 long ranges determine an area to 0.01, but they are from eight rooms only.
     assert told.auc > 0.8
     assert told.unreliability < 0.05
     assert told.brier < 0.8 * vendor_rule(rooms, told).brier
 
 
 @pytest.mark.slow
-def test_reflections_are_told_in_the_half_of_a_real_flight_that_was_not_fitted():
+def test_reflections_are_detected_in_the_unfitted_half_of_a_real_flight():
     shared("miluv_published_calibration.json")
     flight = of_real_flight(shared(FLIGHT).parent)
     late, half = published_error_m(flight, SHARED) > DETOUR_M, len(flight) // 2
@@ -164,7 +167,7 @@ def test_reflections_are_told_in_the_half_of_a_real_flight_that_was_not_fitted()
     assert roc_auc_score(late[known], told[known]) > 0.7
 
 
-# The loop through the wire: bytes change nothing. tests/test_readme.py calibrates served boards.
+# The loop through the wire: encoding and decoding change nothing. tests/test_readme.py calibrates served boards.
 
 
 TRAIN = ROOT / "scenarios" / "icra2023" / "train.toml"

@@ -1,6 +1,7 @@
-"""The page on calibrating without motion capture: its commands run as they stand there, and find what was planted.
+"""The page on calibration without motion capture: its commands run as written, and find the planted values.
 
-Served boards are those of the scenario on ports in virtual time: a recording begins when they stand in the next place.
+Served boards are those of the scenario on ports in virtual time: a recording starts when they stand in the next
+arrangement.
 """
 
 import re
@@ -29,15 +30,15 @@ from uwbsim.scenario.radio import BIAS
 PAGE = (ROOT / "docs" / "without-motion-capture.md").read_text(encoding="utf-8")
 SCENARIO = ROOT / "scenarios" / "string" / "string.toml"
 SHORTER = ("--duration 30", "--duration 9")
-"""What a test changes of the page: six ranges a pair instead of twenty."""
+"""Changes of the commands for the test: six ranges per pair instead of twenty."""
 
 AT_REFERENCE_M = float(
-    BSpline(BIAS["icra2023"]["knots"], BIAS["icra2023"]["coefficients"], 3)(1.0)  # lifted power of -82 dBm
+    BSpline(BIAS["icra2023"]["knots"], BIAS["icra2023"]["coefficients"], 3)(1.0)  # the lifted power of -82 dBm
 )
 PLANTED = {
     tag["id"]: tag["delay_ns"] - AT_REFERENCE_M / 0.299702547 for tag in tomllib.loads(SCENARIO.read_text())["tags"]
 }
-"""Delays as a survey states them: its curve is zero at -82 dBm, where the scenario's is +3.2 cm."""
+"""Delays as a survey states them: its curve is zero at -82 dBm, where that of the scenario is +3.2 cm."""
 
 
 def blocks(label):
@@ -48,7 +49,7 @@ COMMANDS = [line for block in blocks("sh survey") for line in pages.lines(block)
 
 
 class Bench:
-    """The boards of a scenario as `uwbsim serve` has them in a folder, in virtual time."""
+    """The boards of a scenario as served by `uwbsim serve` in a folder, in virtual time."""
 
     def __init__(self, scenario, link_dir):
         self.ports = uwbsim.VirtualPorts(uwbsim.load(scenario))
@@ -56,7 +57,7 @@ class Bench:
         self.stays = iter(stays_s(self.ports.bench.scenario))
 
     def record(self, words):
-        """Run `uwblink record` when the boards stand in their next place; patterns of names are spelt out."""
+        """Run `uwblink record` when the boards stand in their next arrangement; patterns of names are expanded."""
         begin_s, end_s = next(self.stays)
         self.ports.bench.advance(int(begin_s * 1e9))
         names = [name for word in words for name in (self.ports.names.values() if "*" in word else [word])]
@@ -67,7 +68,7 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
-    """The folder after all commands of the tutorial, and what each printed."""
+    """The folder after all commands of the tutorial, and the output of each."""
     folder = tmp_path_factory.mktemp("string")
     shutil.copytree(ROOT / "scenarios" / "string", folder / "scenarios" / "string")
     (taped,) = blocks("toml taped")
@@ -89,28 +90,28 @@ def done(tmp_path_factory):
 
 
 def errors_ns(path):
-    """Errors of delays against what was planted, and their covariance; in the order of tags."""
+    """Return errors of delays against planted values, and their covariance, in order of tags."""
     found = load_calibration(path)
     error = np.array([found.delays_ns[tag] - planted for tag, planted in PLANTED.items()])
     return error, np.array(found.uncertainty.delays_ns2)
 
 
 @pytest.mark.slow
-def test_delays_against_their_mean_are_within_the_promise(done):
+def test_delays_about_their_mean_agree_with_the_plan(done):
     folder, _ = done
     error, spread = errors_ns(folder / "calibration.json")
     plan = calib.plan(6, on="line", size_m=(4.0,), arrangements=8, rate_hz=10.0)
     assert np.abs(error - error.mean()).max() < min(plan.half_ns.values())
-    # What all share is the curve's constant as well: known much less than differences, and within its interval.
+    # The common part is also the constant of the curve: known much less than differences, and within its interval.
     assert 0.05 < np.sqrt(spread.mean()) < 0.3
     assert abs(error.mean()) < 2 * np.sqrt(spread.mean())
 
 
 @pytest.mark.slow
-def test_one_distance_by_tape_settles_what_all_share(done):
+def test_one_measured_distance_determines_the_common_delay(done):
     folder, _ = done
     error, spread = errors_ns(folder / "taped.json")
-    # Six ranges a pair, whose noise is that of all pairs: of its own six a pair says 6 % too little.
+    # Six ranges per pair, with the noise of all pairs: from its own six, a pair would get 6 % too little.
     assert np.sqrt(spread.mean()) < 0.03
     assert np.all(np.abs(error) < 0.08)
     assert abs(error.mean()) < 2 * np.sqrt(spread.mean())
@@ -142,7 +143,7 @@ def test_the_commands_are_those_of_the_plan_and_the_boards_stand_as_planned(done
 
 
 @pytest.mark.slow
-def test_recordings_carry_what_was_said_of_their_arrangement(done):
+def test_recordings_have_the_stated_arrangement(done):
     folder, _ = done
     (mark,) = uwblink.load(folder / "B.uwb").arrangements
     assert (mark.name, mark.known, mark.order) == ("B", "line", (2, 1, 5, 4, 6, 3))
@@ -150,7 +151,7 @@ def test_recordings_carry_what_was_said_of_their_arrangement(done):
     assert after.order == uwblink.load(folder / "A.uwb").arrangements[0].order
 
 
-def test_the_file_of_what_is_known_is_read_as_it_stands_there(tmp_path):
+def test_the_file_of_known_facts_on_the_page_is_read(tmp_path):
     (example,) = re.findall(r"^```toml\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
     (tmp_path / "known.toml").write_text(example)
     known = load_knowledge(tmp_path / "known.toml")

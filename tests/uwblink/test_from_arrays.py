@@ -1,4 +1,4 @@
-"""Exchanges and poses from what a caller has, and back into columns; how they look."""
+"""Exchanges and poses from arrays, and as columns; their text form."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ DS: dict[str, Any] = SS | {"tx3": [99_005, 99_003], "rx3": [101_000, 101_009]}
 
 
 def test_ranges_without_stamps_are_those_of_a_table_without_stamps(tmp_path):
-    """An importer of one's own for a device that prints ranges needs no stamps."""
+    """A registered importer for a device that prints ranges needs no stamps."""
     (tmp_path / "t.csv").write_text("time_s,from_id,to_id,range_m,fpp2\n0.5,1,7,3.1,-82.5\n0.6,2,7,3.2,-83.0\n")
     table = read_source(tmp_path / "t.csv").exchanges
     mine = Exchanges.from_arrays(
@@ -34,7 +34,7 @@ def test_ranges_without_stamps_are_those_of_a_table_without_stamps(tmp_path):
             Exchanges.from_arrays(1, 2, **columns)
 
 
-def test_one_value_stands_for_all_rows_and_floats_of_whole_numbers_will_do():
+def test_one_value_applies_to_all_rows_and_whole_floats_are_accepted():
     floats: Any = {k: np.array(v, dtype=float) for k, v in DS.items()}
     x = Exchanges.from_arrays(1, 2, **floats, protocol="ds-alt")
     assert (x.target.tolist(), x.protocol.tolist(), str(x.tx3.dtype)) == ([2, 2], ["ds-alt"] * 2, "int64")
@@ -90,7 +90,7 @@ def test_rows_are_chosen_by_number_slice_and_mask():
 
 
 @pytest.mark.parametrize("count", [0, 1, 6, 7, 10_000])
-def test_what_is_printed_fits_on_a_screen(count):
+def test_printed_tables_fit_on_a_screen(count):
     stamps: Any = {name: np.arange(count) + 2**31 for name in SS}
     x = Exchanges.from_arrays(1, 2, **stamps, time_ns=2**60)
     poses = Poses.from_arrays(np.arange(count) + 2**60, "\x1b[31m" + "long" * 30, (1 / 3, -2 / 3, 1e-9))

@@ -30,7 +30,7 @@ def ended(process, number=signal.SIGINT):
     try:
         out, err = process.communicate(timeout=60)
     except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGABRT)  # it prints where it stands
+        process.send_signal(signal.SIGABRT)  # it prints in its own folder
         raise AssertionError(process.communicate()) from None
     assert "Traceback" not in err, err
     return out, err
@@ -82,12 +82,12 @@ def flight(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_report_that_is_interrupted_says_so_and_leaves_no_half(flight, tmp_path):
+def test_an_interrupted_report_is_reported_and_leaves_no_partial_file(flight, tmp_path):
     process = started("calib", "report", str(flight), "-o", str(tmp_path / "page.html"))
     wait_for(lambda: is_working(process), process)
     time.sleep(1.0)
     _, err = ended(process)
-    # On a quick machine it may have been done before.
+    # On a fast machine it may have ended before.
     assert process.returncode in (130, 0)
     assert ("interrupted" in err) == (process.returncode == 130)
     assert files(tmp_path) == ([] if process.returncode else ["page.html"])
@@ -95,7 +95,7 @@ def test_a_report_that_is_interrupted_says_so_and_leaves_no_half(flight, tmp_pat
 
 
 @pytest.mark.slow
-def test_an_import_that_is_interrupted_is_one_line_and_leaves_nothing(tmp_path):
+def test_an_interrupted_import_prints_one_line_and_leaves_no_file(tmp_path):
     row = "{0}.25,{1},9,{2:.3f},-80.5,-81.5\n"
     with (tmp_path / "t.csv").open("w") as file:
         file.write("time_s,from_id,to_id,range_m,fpp1,fpp2\n")
@@ -104,7 +104,7 @@ def test_an_import_that_is_interrupted_is_one_line_and_leaves_nothing(tmp_path):
     wait_for(lambda: is_working(process), process)
     time.sleep(0.2)
     _, err = ended(process)
-    # On a quick machine it may have been done before.
+    # On a fast machine it may have ended before.
     assert (process.returncode, err) in ((130, "interrupted\n"), (0, ""))
     assert files(tmp_path) == (["t.csv"] if process.returncode else ["t.csv", "t.uwb"])
 
@@ -118,8 +118,8 @@ def test_an_import_that_is_interrupted_is_one_line_and_leaves_nothing(tmp_path):
         (signal.SIGTERM, ("calib", "apply", "../long.uwb", "-c", "../c.json", "-o", "f.uwb")),
     ],
 )
-def test_a_writer_that_is_ended_leaves_nothing(long, tmp_path, words, number):
-    """Ended as soon as it has begun to write, which a poll of its folder sees."""
+def test_a_terminated_writer_leaves_no_file(long, tmp_path, words, number):
+    """Interrupted when the first file appears in its folder."""
     folder = long.parent / f"{tmp_path.name}"
     folder.mkdir()
     process = subprocess.Popen(
@@ -152,6 +152,6 @@ def wait_for(ready, process):
 
 
 def is_working(process):
-    """Whether a process has used a second's half of processor time, so that its start is behind it."""
+    """Return whether a process has used half a second of processor time, so that its start is over."""
     fields = Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()
     return int(fields[11]) + int(fields[12]) > os.sysconf("SC_CLK_TCK") / 2

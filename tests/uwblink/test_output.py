@@ -1,4 +1,4 @@
-"""Output files: whole or not there at all."""
+"""Output files: complete or absent."""
 
 import signal
 import tempfile
@@ -13,7 +13,7 @@ from uwblink.output import check_apart, write_bytes, write_files, write_text
 from uwblink.text_files import read_text
 
 
-def test_text_is_utf8_and_nothing_is_left_beside_it(tmp_path):
+def test_text_is_utf8_and_no_temporary_file_remains(tmp_path):
     write_text(tmp_path / "a.txt", "± 1 µs\n", force=False)
     assert (tmp_path / "a.txt").read_bytes() == "± 1 µs\n".encode()
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
@@ -54,7 +54,7 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
         write_files(tmp_path / "file" / "er", {"a": b""}, force=False)
 
 
-# Files that cannot be read as text: one line each, in the caller's error.
+# Files that cannot be read as text: one line each, as the caller's error.
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
         ("n" * 300, "(File name too long)"),
     ],
 )
-def test_what_cannot_be_read_is_one_line(tmp_path, name, line):
+def test_unreadable_text_files_are_one_line(tmp_path, name, line):
     (tmp_path / "folder").mkdir()
     (tmp_path / "latin1").write_bytes("abcé".encode("latin-1"))
     with pytest.raises(ImportTableError, match=one_line(line)) as found:
@@ -75,14 +75,14 @@ def test_what_cannot_be_read_is_one_line(tmp_path, name, line):
     assert "\0" not in str(found.value)
 
 
-def test_text_comes_back_as_it_is(tmp_path):
+def test_text_is_read_as_it_was_written(tmp_path):
     (tmp_path / "text").write_text("µ\n", encoding="utf-8")
     assert read_text(tmp_path / "text", ValueError) == "µ\n"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_that_another_thread_receives_as_a_file_begins_leaves_nothing(tmp_path, monkeypatch, number):
-    """Python handles it in the main thread, where it must not part the making of a folder from its removal."""
+    """Python handles it in the main thread, where it must not come between making a folder and its removal."""
 
     def leave(*_):
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""Receptions of frames: what broadcasts and exchanges say of each other, by clocks that share no code with them."""
+"""Receptions of frames: consistency of broadcasts and exchanges, by clocks that share no code with them."""
 
 from dataclasses import replace
 from typing import Any
@@ -18,7 +18,7 @@ START = np.array([0.7, 3.1, 16.9, 9.0]) / TICK_S
 
 
 def broadcasts(rounds=20, lost=(), slot_s=0.005):
-    """Return receptions of four tags that send in turn, by clocks that run at their own rates."""
+    """Return receptions of four tags that send in turn, with clocks of different rates."""
 
     def stamp(tag, t):
         return int(np.rint(START[tag] + RATE[tag] * t / TICK_S)) % (1 << 40)
@@ -42,7 +42,7 @@ def test_a_counter_that_restarts_makes_no_range():
     restarted = Receptions.from_arrays(r.frame, r.sender, r.listener, tx=tx, rx=rx, time_ns=r.time_ns)
     exchanges, _ = exchanges_in(restarted)
     assert np.abs(errors_m(exchanges)).max() < 0.01
-    # Of the three pairs of that tag one exchange each spans the restart, or two.
+    # One or two exchanges of each of the three pairs of that tag span the restart.
     count = len(exchanges_in(r)[0])
     assert count - 6 <= len(exchanges) <= count - 3
 
@@ -52,7 +52,7 @@ HUNDRED_NS = 6400
 
 
 def with_errors(r, ticks, listener=12):
-    """Receptions with reception stamps of a listener that are wrong by ticks, by frame."""
+    """Return receptions in which stamps of a listener are wrong by ticks, by frame."""
     rx = r.rx.copy()
     for frame, off in ticks.items():
         rows = (r.frame == frame) & (r.listener == listener)
@@ -81,7 +81,7 @@ def errors_m(exchanges):
     ],
 )
 def test_stamps_that_others_contradict_make_no_range(lost, ticks, cost):
-    """Frames 0, 4, 8 ... are sent by tag 10: of 20, six stay near each wrong one, and decide."""
+    """Frames 0, 4, 8 ... are sent by tag 10: of 20, six are near each wrong one, and decide."""
     r = broadcasts(lost={(frame, 2) for frame in lost}, slot_s=0.02)
     whole, _ = exchanges_in(r)
     wrong = with_errors(r, ticks)
@@ -93,8 +93,8 @@ def test_stamps_that_others_contradict_make_no_range(lost, ticks, cost):
     assert not np.isin(np.concatenate([overheard["rx1"], overheard["rx2"], overheard["rx3"]]), there).any()
 
 
-def test_a_link_that_nobody_can_rely_on_makes_no_range_and_others_do():
-    """As one of seven recorded boards heard another: half of what it received is wrong by 80 to 350 ns."""
+def test_unreliable_links_give_no_ranges():
+    """As one of seven recorded boards received another: half of its receptions are wrong by 80 to 350 ns."""
     draw = np.random.default_rng(7)
     r = broadcasts(rounds=30, slot_s=0.08)
     frames = draw.choice(np.arange(0, 120, 4), 15, replace=False).tolist()
@@ -115,7 +115,7 @@ def test_a_clock_that_jumps_costs_the_ranges_beside_the_jump_alone():
 
 @pytest.mark.parametrize(("rate_hz", "loss"), [(200, 0.3), (20, 0.3), (5, 0.0)])
 def test_no_stamp_of_flying_tags_is_left_out(rate_hz, loss):
-    """Two quadcopters turn at 0.8 m/s under 100 ps of noise, and clocks drift, while frames are lost."""
+    """Two quadcopters turn at 0.8 m/s with 100 ps of noise, clocks drift, and frames are lost."""
     changes = {"ranging.rate_hz": rate_hz, "run.duration_s": 1200 / rate_hz}
     columns: Any = uwbsim.simulate(uwbsim.load("broadcast", changes)).receptions
     r = Receptions(**columns)
@@ -128,11 +128,11 @@ def test_times_are_those_of_the_clocks_that_stamped_last():
     assert times_by_stamps(r) == pytest.approx(r.time_ns - r.time_ns[0], abs=72e9 * 12e-6)
     silent = (
         ((r.sender == 13) | (r.listener == 13)) & (r.frame >= 400) & (r.frame < 1000)
-    )  # 12 s: more than half a turn
+    )  # 12 s: more than half a wrap
     assert times_by_stamps(r[~silent])[-1] == pytest.approx(r.time_ns[-1] - r.time_ns[0], abs=72e9 * 12e-6)
 
 
-def test_receptions_that_cannot_be_are_refused_by_name():
+def test_wrong_receptions_are_refused():
     with pytest.raises(ArgumentError, match="listener: row 1"):
         Receptions.from_arrays([0, 1], [1, 2], [2, 2], tx=0, rx=1)
     with pytest.raises(ArgumentError, match="2 receptions contain no exchange"):

@@ -1,4 +1,4 @@
-"""A protocol that somebody adds at run time: what is taken, what is refused, and why."""
+"""A protocol that is registered at run time: accepted ones, refused ones, and the reasons."""
 
 from dataclasses import replace
 
@@ -25,12 +25,12 @@ REPLY = ProtocolMessage("target", "rx1", "scheduled")
 
 
 def mean_of_trips(t):
-    """Half of what is left of both round trips, on average: exact where both replies are equal."""
+    """Return half of the mean rest of both round trips: exact if both replies are equal."""
     return (t.dt41 - t.dt32 + t.dt64 - t.dt53) / 4
 
 
 def in_targets_clock(t):
-    """ICRA 2023, eq. (2), with the round trip rescaled in place of the reply."""
+    """ICRA 2023, eq. (2), with the round trip rescaled instead of the reply."""
     return (t.dt41 * t.dt53 / t.dt64 - t.dt32) / 2
 
 
@@ -69,7 +69,7 @@ def test_the_projects_own_rows_pass_their_own_check(name):
 @pytest.mark.parametrize("registered", [TARGETS], indirect=True)
 def test_skew_and_delays_go_through_the_registered_formula(registered):
     e = exchange(registered.name, 1000, 20_000_000, 98_320_384, 7, -4)
-    # Six stamps cut to whole ticks, weighted by up to 1.2, halved.
+    # Six stamps rounded to whole ticks, with weights up to 1.2, halved.
     assert time_of_flight(e)[0] / TICK_S == pytest.approx(1000, abs=2.5)
     moved = (time_of_flight(replace(e, rx1=e.rx1 + 4000)) - time_of_flight(e))[0] / TICK_S
     assert moved == pytest.approx(4000 * delay_weights(e)[1][0], abs=1e-3)
@@ -89,7 +89,7 @@ def test_exchanges_of_an_unknown_protocol_are_refused_by_name():
             function(unknown)
 
 
-def test_names_are_taken_once(registered):
+def test_names_of_protocols_are_unique(registered):
     with pytest.raises(ArgumentError, match=r"already registered; choose another name, or use replace=True"):
         register_protocol(registered)
     register_protocol(replace(registered, title="better"), replace=True)
@@ -145,13 +145,13 @@ def backwards(t):
         ({"delay_weights": backwards}, "delay_weights leave 936 ticks .* antenna delays of 64 and 0"),
     ],
 )  # fmt: skip
-def test_what_cannot_work_is_refused_in_one_line(change, expected):
+def test_wrong_protocols_are_refused_in_one_line(change, expected):
     with pytest.raises(ArgumentError, match=rf"\A.*({expected}).*\Z"):
         register_protocol(replace(SYMMETRIC, **change))
     assert SYMMETRIC.name not in PROTOCOLS
 
 
-def test_what_is_no_protocol_is_refused():
+def test_other_objects_than_protocols_are_refused():
     with pytest.raises(ArgumentError, match="found 'ds', expected a RangingProtocol"):
         register_protocol("ds")  # type: ignore[arg-type]
 

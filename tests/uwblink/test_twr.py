@@ -1,4 +1,4 @@
-"""Formulas of the protocols against exact arithmetic and finite differences."""
+"""Formulas of the protocols compared with exact arithmetic and finite differences."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -26,13 +26,13 @@ from uwblink.twr import (
 
 
 def initiator_stamps(protocol):
-    """The stamps of the initiator's clock: it stamps what it sends and what it receives."""
+    """Return the stamps of the initiator's clock: of its transmissions and receptions."""
     senders = [message.sender for message in PROTOCOLS[protocol].messages]
     return tuple(f"{'tx' if sender == 'initiator' else 'rx'}{k}" for k, sender in enumerate(senders, start=1))
 
 
 def exchange(protocol, flight, reply, third, gamma_i, gamma_j, start=0, bits=32):
-    """An exchange in exact rationals, rounded to whole ticks only at the end."""
+    """Return an exchange in exact rationals, rounded to whole ticks only at the end."""
     sender = PROTOCOLS[protocol].messages[-1].sender
     true = {"tx1": 0, "rx1": flight, "tx2": flight + reply, "rx2": 2 * flight + reply}
     if len(PROTOCOLS[protocol].messages) == 3:
@@ -65,7 +65,8 @@ def test_elapsed_undoes_addition_whatever_the_wrap(start, duration, bits):
 )
 def test_double_sided_finds_the_flight_time_whatever_the_skews(protocol, flight, reply, third, gi, gj, start):
     found = time_of_flight(exchange(protocol, flight, reply, third, gi, gj, start))[0] / TICK_S
-    # Six stamps cut to whole ticks, weighted by up to 1 + r <= 4 (docs/theory.md), halved; and the skew's share.
+    # Six stamps rounded to whole ticks, with weights up to 1 + r <= 4 (docs/theory.md), halved; and the part of the
+    # skew.
     assert abs(found - flight) < 2 * (1 + reply / third) + flight * 2e-5
 
 
@@ -76,7 +77,7 @@ def test_single_sided_carries_half_the_relative_skew_times_the_reply():
 
 def test_the_carrier_takes_the_skew_out():
     found = time_of_flight(exchange("ss-cfo", 1000, 98_320_384, 0, 5, -5))[0] / TICK_S
-    # The reply is half a tick wrong at each end, the flight by its own skew.
+    # The reply has an error of half a tick at each end, the flight that of its own skew.
     assert found - 1000 == pytest.approx(0, abs=1)
     blind = replace(exchange("ss-cfo", 1000, 98_320_384, 0, 5, -5), skew2_ppm=np.array([0.0]))
     assert time_of_flight(blind)[0] == pytest.approx(time_of_flight(exchange("ss", 1000, 98_320_384, 0, 5, -5))[0])
@@ -102,7 +103,7 @@ def test_truncation_is_towards_zero_and_keeps_what_has_four_decimals():
 
 
 def test_stamps_belong_to_the_clocks_of_the_paper():
-    # ICRA 2023, fig. 2, and the course in which the initiator sends the third message.
+    # ICRA 2023, fig. 2, and the variant in which the initiator sends the third message.
     assert initiator_stamps("ss") == initiator_stamps("ss-cfo") == ("tx1", "rx2")
     assert initiator_stamps("ds") == ("tx1", "rx2", "rx3")
     assert initiator_stamps("ds-alt") == initiator_stamps("ds-sym") == ("tx1", "rx2", "tx3")
@@ -111,7 +112,7 @@ def test_stamps_belong_to_the_clocks_of_the_paper():
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("protocol", ["ds", "ds-alt", "ds-sym"])
 def test_degenerate_stamps_make_no_range_and_no_warning(protocol):
-    # Neither reply nor third leg lasted by the target: K is infinite, and zero times K is nothing.
+    # Reply and third interval are zero by the target: K is infinite, and zero times K is NaN.
     none = Exchanges.from_arrays([1], [2], tx1=[0], rx1=[9], tx2=[9], rx2=[50], tx3=[9], rx3=[70], protocol=protocol)
     assert protocol != "ds" or not np.isfinite(time_of_flight(none)[0])
 
@@ -121,10 +122,10 @@ def test_boards_print_single_sided_ranges_of_whole_ticks_and_cut_all_of_them():
         stamps: Any = {"tx1": [0], "rx1": [1000], "tx2": [101_000], "rx2": [rx2]}
         return board_range(Exchanges.from_arrays(1, 2, **stamps, **third, protocol=protocol))[0]
 
-    # (102 001 - 100 000)/2 = 1000.5 ticks: 1000 of 4.690357 mm are 4.69035..., and half a tick more of ds is kept.
+    # (102 001 - 100 000)/2 = 1000.5 ticks: 1000 of 4.690357 mm are 4.69035..., and ds keeps the half tick.
     assert (printed(102_001, "ss"), printed(102_000, "ss")) == (4.6903, 4.6903)
     assert printed(102_001, "ds", tx3=[201_000], rx3=[202_001]) == 4.6927
-    # Towards zero from below, too: -0.5 ticks are none, -1.5 are one.
+    # Towards zero also from below: -0.5 ticks become 0, -1.5 become -1.
     assert (printed(99_999, "ss"), printed(99_997, "ss")) == (0.0, -0.0046)
 
 
@@ -140,7 +141,7 @@ def test_a_row_without_any_stamp_has_the_range_that_was_reported():
     np.testing.assert_allclose(time_of_flight(e)[0], 7.5 / SPEED_OF_LIGHT, rtol=1e-12)
 
 
-def test_a_stamp_that_is_too_long_says_that_wider_ones_need_bits():
+def test_the_error_for_a_wide_stamp_names_the_option_bits():
     stamps: Any = {"tx1": [2**32], "rx1": [5], "tx2": [1005], "rx2": [3000]}
     with pytest.raises(ArgumentError, match="stamps of 40 bits need bits=40"):
         Exchanges.from_arrays(1, 2, **stamps)
@@ -152,7 +153,7 @@ def test_a_stamp_that_is_too_long_says_that_wider_ones_need_bits():
 
 @pytest.mark.parametrize(("protocol", "after"), [("ss", 0.5), ("ds", 0.0), ("ds-alt", 1.0), ("ds-sym", 1.0)])
 def test_the_time_of_a_range_is_that_of_the_distance_it_measures(protocol, after):
-    """While a distance grows at a constant speed, by messages whose flights are solved one by one."""
+    """A distance grows at constant speed; flights of messages are solved one by one."""
     speed, start, reply, third = 50.0, 10.0, 0.02, 0.031
 
     def arrival(sent):
@@ -168,5 +169,5 @@ def test_the_time_of_a_range_is_that_of_the_distance_it_measures(protocol, after
     x = Exchanges.from_arrays([1], [2], protocol=protocol, bits=40, **stamps)
     when_s = range_ns(x)[0] * 1e-9
     assert when_s == pytest.approx(after * times[3], abs=2e-9)
-    # A metre lies between poll and response; rounded stamps are 4.7 mm, flights of 10 m last 33 ns.
+    # The distance changes by a metre between poll and response; rounded stamps are 4.7 mm, flights of 10 m last 33 ns.
     assert raw_range(x)[0] == pytest.approx(start + speed * when_s, abs=0.01)

@@ -41,7 +41,7 @@ def test_a_scenario_is_a_file_a_text_tables_or_itself():
         (NOISELESS, {"run.seed.x": 1}, r"^run\.seed\.x: seed is not a table"),
     ],
 )
-def test_mistakes_say_where(source, overrides, message):
+def test_errors_in_scenarios_name_the_place(source, overrides, message):
     with pytest.raises(uwbsim.ScenarioError, match=message):
         uwbsim.simulate(uwbsim.load(source, overrides))
 
@@ -56,7 +56,7 @@ def test_a_notebook_shows_the_tags_of_a_scenario():
     assert ("&lt;b&gt;" in page, page.count("data:image/png")) == (True, 1)
 
 
-def test_what_a_flight_prints_and_saves_is_true(tmp_path):
+def test_printed_and_saved_flights_agree(tmp_path):
     flight = uwbsim.simulate(uwbsim.load(NOISELESS, SHORT))
     lines = str(flight).splitlines()
     assert (2 <= len(lines) <= 6, max(map(len, lines)) <= 100) == (True, True)
@@ -72,14 +72,14 @@ def test_what_a_flight_prints_and_saves_is_true(tmp_path):
     flight.save(tmp_path / "f.uwb", force=True)
 
 
-# Tables that are whole or not there at all; what they hold is tested by sweeps and comparisons.
+# Tables that are complete or absent; sweeps and comparisons test their content.
 
 
 ROWS = [{"name": "a", "n": 1, "x": 0.5}, {"name": "b", "n": 2, "x": None}]
 
 
 class Failing:
-    """Rows that can be read once, and then only in part."""
+    """Rows that can be read once, and the second time only partly."""
 
     def __init__(self):
         self.left = 3
@@ -102,13 +102,13 @@ def test_tables_that_fail_half_way_leave_what_was_there(tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["t.csv", "t.parquet"]
 
 
-# Errors of uwbsim name parameters, and its command line the flags that stand for them.
+# Errors of uwbsim name parameters, and its command line the flags for them.
 
 
 ROOT = NOISELESS.parents[1]
 COMMANDS: Any = typer.main.get_command(app)
 OPTIONS = {"/".join(p.opts) for command in COMMANDS.commands.values() for p in command.params}
-# Of functions that no command calls with what a user typed.
+# Of functions that no command calls with values of a user.
 ONLY_FROM_PYTHON = {"effect", "source", "name", "evaluate", "lost_share"}
 
 

@@ -26,7 +26,7 @@ def fitted():
     return calib.fit(ranges()).calibration
 
 
-def test_no_register_is_written_for_a_delay_that_the_data_left_free(fitted):
+def test_undetermined_delays_have_no_registers(fitted):
     known = replace(fitted, delays_std_ns={**fitted.delays_std_ns, 2: math.inf, 3: math.inf})
     with pytest.raises(calib.BadInputError, match=r"`to`: the data do not determine the delay of tag 2, 3"):
         calib.export(known, "registers")
@@ -34,7 +34,7 @@ def test_no_register_is_written_for_a_delay_that_the_data_left_free(fitted):
     assert "delay_ns" in calib.export(known, "ros-yaml")
 
 
-def test_registers_go_on_top_of_what_was_programmed(tmp_path, fitted):
+def test_registers_add_to_programmed_delays(tmp_path, fitted):
     known = replace(fitted, delays_ns={1: 0.25, 2: -513.5})
     single = {"configured_antenna_delay_ticks_by_tag": {"1": {"tx": 16440, "rx": 16430}}}
     meta = {"configured_antenna_delay_ticks": {"tx": 0, "rx": 0}, **single}
@@ -188,7 +188,7 @@ MILUV = '{"delays_ns": {"1": 0.1}, "bias_spline_m": %s, "std_spline_m": %s}'
         ("0.1", 100_000 * "[" + 100_000 * "]"),
     ],
 )
-def test_numbers_that_are_none_do_not_come_in_with_a_miluv_calibration(tmp_path, old, new):
+def test_miluv_calibrations_with_infinite_numbers_are_refused(tmp_path, old, new):
     good = MILUV % (SPLINE, SPLINE)
     (tmp_path / "m.json").write_text(good)
     assert read_miluv(tmp_path / "m.json").delays_ns == {1: 0.1}
@@ -197,7 +197,7 @@ def test_numbers_that_are_none_do_not_come_in_with_a_miluv_calibration(tmp_path,
         read_miluv(tmp_path / "m.json")
 
 
-def test_a_form_with_one_curve_does_not_take_groups():
+def test_formats_with_one_curve_refuse_groups():
     grouped = calib.fit(ranges(2000), groups={"a": (1, 2), "b": (3, 7)}).calibration
     for form in ("miluv", "ros-yaml", "c-header"):
         with pytest.raises(calib.BadInputError, match="export it as json"):

@@ -49,7 +49,7 @@ def powers_at(lift, power_at, first, second):
     [("mean-of-lifted", "exchange"), ("lift-of-mean", "exchange"), ("mean-of-lifted", "reception")],
 )
 @pytest.mark.parametrize("grouped", [False, True])
-def test_a_range_is_corrected_as_the_formulas_say(fitted, lift, power_at, grouped):
+def test_ranges_are_corrected_by_the_formulas(fitted, lift, power_at, grouped):
     """A range is corrected by half of each delay and the mean curve of both tags, at the available powers; one range,
     or arrays.
     """
@@ -246,7 +246,7 @@ MODEL = ErrorModel(
 )
 
 
-def test_errors_beyond_everything_are_outliers():
+def test_errors_far_beyond_all_densities_are_outliers():
     shapes = MODEL.shapes(np.full(3, 0.5), np.full(3, 1), np.full(3, 2))
     tail, outlier = MODEL.tail_given(np.array([-3.0, 80.0, 1e6]), shapes)
     assert outlier[0] > 0.999
@@ -254,7 +254,7 @@ def test_errors_beyond_everything_are_outliers():
     assert np.isfinite(tail).all()
 
 
-def test_what_an_error_was_follows_from_the_densities_of_scipy():
+def test_probabilities_given_an_error_agree_with_scipy():
     model = replace(MODEL, outlier_share=0.05, outlier_m=3.0)
     error = np.linspace(-1, 4, 101)
     shapes = model.shapes(np.full(101, 0.5), np.full(101, 3), np.full(101, 7))
@@ -270,7 +270,7 @@ def error_fitted():
     return calib.fit(calib.sample_flight()).calibration
 
 
-def test_a_file_gives_it_back_and_files_without_it_open(error_fitted):
+def test_error_models_are_read_unchanged_and_may_be_missing(error_fitted):
     assert error_fitted.errors is not None
     again = Calibration.from_json(error_fitted.to_json())
     assert again.errors == error_fitted.errors
@@ -309,7 +309,7 @@ def test_a_damaged_model_is_one_clear_error(error_fitted, key, value, said):
         Calibration.from_json(json.dumps(document), "here")
 
 
-def test_a_fit_says_how_long_errors_of_a_pair_last():
+def test_a_fit_estimates_the_persistence_of_errors():
     """Half of the variance is a Gauss-Markov process of each pair with a correlation time of half a second."""
     flight = calib.load_ranges(calib.sample_flight(9000))
     rng, shared = np.random.default_rng(5), np.zeros(len(flight))
@@ -326,7 +326,7 @@ def test_a_fit_says_how_long_errors_of_a_pair_last():
 
 
 @pytest.mark.parametrize("renewal_s", [0.0, 0.3, 1.0])
-def test_a_fit_says_how_long_reflections_of_a_pair_last(renewal_s):
+def test_a_fit_estimates_the_duration_of_reflections(renewal_s):
     """A fifth of the ranges is reflected; ranges of a pair are 30 ms apart."""
     flight = calib.load_ranges(calib.sample_flight(9000))
     rng, detour_m = np.random.default_rng(6), np.zeros(len(flight))
@@ -340,7 +340,7 @@ def test_a_fit_says_how_long_reflections_of_a_pair_last(renewal_s):
 
 
 @pytest.mark.parametrize("shares", [[], [0.0], [1.2], [[0.5]]])
-def test_shares_that_are_none(error_fitted, shares):
+def test_quantiles_refuse_wrong_shares(error_fitted, shares):
     with pytest.raises(calib.BadInputError, match=r"`shares`: .*between 0 and 1"):
         error_fitted.quantiles(calib.load_ranges(calib.sample_flight()), shares)
 
@@ -349,7 +349,7 @@ def test_shares_that_are_none(error_fitted, shares):
 
 
 @pytest.mark.slow
-def test_fits_of_the_same_tags_are_the_same_nineteen_times_in_twenty():
+def test_fits_of_the_same_tags_differ_in_5_percent_of_comparisons():
     fits = [calib.fit(ranges(3000, seed=seed)).calibration for seed in range(9)]
     found = [calib.compare(a, b) for a, b in itertools.pairwise(fits)]
     # 8 comparisons with 0.4 expected differences; more than three occur by chance in less than one of a thousand cases.
@@ -360,7 +360,7 @@ def test_fits_of_the_same_tags_are_the_same_nineteen_times_in_twenty():
     assert 0.55 < np.std([d / one.std_ns[t] for one in found for t, d in one.difference_ns.items()]) < 1.3
 
 
-def test_a_delay_that_moved_is_seen(fitted):
+def test_a_changed_delay_is_detected(fitted):
     found = calib.compare(fitted, replace(fitted, delays_ns=fitted.delays_ns | {3: fitted.delays_ns[3] + 0.2}))
     assert not found.same
     assert max(found.difference_ns, key=lambda t: abs(found.difference_ns[t])) == 3
@@ -368,7 +368,7 @@ def test_a_delay_that_moved_is_seen(fitted):
         assert part in str(found)
 
 
-def test_a_shift_of_delays_against_the_curve_is_no_difference(fitted):
+def test_a_common_shift_of_delays_and_curve_is_no_difference(fitted):
     moved_ns = {tag: delay + 0.05 / SPEED_OF_LIGHT * 1e9 for tag, delay in fitted.delays_ns.items()}
     curve = replace(fitted.bias_curve, coefficients=tuple(c + 0.05 for c in fitted.bias_curve.coefficients))
     found = calib.compare(fitted, replace(fitted, delays_ns=moved_ns, bias_curve=curve))
@@ -377,12 +377,12 @@ def test_a_shift_of_delays_against_the_curve_is_no_difference(fitted):
     assert np.abs(list(found.difference_ns.values())).max() < 1e-9
 
 
-def test_nothing_in_common_cannot_be_compared(fitted):
+def test_calibrations_without_common_tags_are_not_compared(fitted):
     with pytest.raises(calib.UnanswerableError, match="0 tags have determined delays in both"):
         calib.compare(fitted, replace(fitted, delays_ns={99: 0.0}))
 
 
-def test_of_pairs_that_are_not_determined_the_others_are_corrected_and_they_are_named(tmp_path):
+def test_undetermined_pairs_are_named_and_other_pairs_corrected(tmp_path):
     """Two tags and two anchors; in the second flight the tags also range with each other."""
     flight = calib.sample_flight(180)
     e = flight.exchanges

@@ -45,7 +45,7 @@ def test_checks_that_involve_chance_share_one_budget_and_the_page_shows_them_all
     assert set(IMPLIED).union(*IMPLIED.values(), *(case.expected for case in planted.FAULTS)) <= told.keys()
 
 
-def test_the_worst_of_many_is_no_surer_than_one_of_one():
+def test_p_values_account_for_the_number_of_tests():
     worst = np.max(np.abs(RNG(7).standard_t(9, (2000, 60))), axis=1)
     p_values = np.array([exceeds(float(value), 1.0, 9, tried=60) for value in worst])
     assert 0.03 < np.mean(p_values < 0.05) < 0.065
@@ -111,7 +111,7 @@ def starloc():
     ],
     ids=["right", "by number", "by order"],
 )
-def test_markers_that_are_other_radios_are_seen(starloc, tmp_path, marker_of, wrong, exchanged):
+def test_exchanged_markers_of_radios_are_detected(starloc, tmp_path, marker_of, wrong, exchanged):
     ranges, markers = starloc
     names = [*STARLOC[:-1], "range_m", *(f"{end}_{k}_m" for end in ("from", "to") for k in "xyz")]
     rows = [
@@ -132,7 +132,7 @@ def test_markers_that_are_other_radios_are_seen(starloc, tmp_path, marker_of, wr
     assert {one.fault for one in found} == {"too few pairs", other}
 
 
-def test_coarse_ranges_that_follow_fast_are_not_doubled_exchanges(tmp_path):
+def test_equal_coarse_ranges_are_not_doubled_exchanges(tmp_path):
     """At 33 Hz per pair, with centimetres and whole decibels, one row in fifty equals the previous one of its pair."""
     numbers = RNG(1).normal((3.0, -80.0), (0.04, 1.0), (3000, 2))
     ends = ("1,2", "1,3", "2,3")
@@ -172,7 +172,7 @@ def test_power_and_distance_are_not_confounded_outdoors(tmp_path):
     }
 
 
-def test_two_seconds_of_one_pair_say_nothing_of_power_and_distance():
+def test_two_seconds_of_one_pair_have_no_finding_on_power_and_distance():
     """Distance explains three fifths of the power and directions the rest; 2 s count as one value, so no share is
     significant.
     """
@@ -187,7 +187,7 @@ def test_two_seconds_of_one_pair_say_nothing_of_power_and_distance():
 
 
 @pytest.mark.slow
-def test_a_fit_in_a_room_settles():
+def test_a_fit_in_a_room_converges():
     """Steps by the information matrix alone do not converge here within a hundred iterations."""
 
     room = uwbsim.simulate(uwbsim.load("room/room", {"run.duration_s": 60.0, "run.seed": 50_000}))

@@ -174,7 +174,7 @@ UNREAD = "single-sided without carrier readings"
         ),
     ],
 )
-def test_the_fault_is_named_and_nothing_else(plan, plant, fault, told):
+def test_only_the_planted_fault_is_named(plan, plant, fault, told):
     (found,) = calib.examine(plant(fly(plan, 94), RNG(3)))
     assert found.fault == fault
     assert re.search(told, f"{found.evidence}; {found.remedy}")
@@ -195,7 +195,7 @@ def test_the_fault_is_named_and_nothing_else(plan, plant, fault, told):
         (SHORT, planted.few_pairs, ["corrupted exchanges", "too few pairs"]),
     ],
 )
-def test_all_that_is_wrong_is_named(plan, plant, expected):
+def test_several_faults_are_all_named(plan, plant, expected):
     assert faults(plant(fly(plan, 98), RNG(3))) == expected
 
 
@@ -216,7 +216,7 @@ def test_recordings_of_scenarios_without_a_fault_have_no_finding():
         assert faults(uwbsim.simulate(uwbsim.load(name, settings))) == expected
 
 
-def test_the_remedy_for_attitudes_of_another_frame_undoes_it():
+def test_the_remedy_for_rotated_attitudes_is_the_inverse_rotation():
     flight, rng = fly(SHORT, 3), RNG(5)
     turned = planted.turned_attitudes(flight, rng)
     found = only(turned, "attitudes in another frame")
@@ -249,7 +249,7 @@ def test_poses_that_repeat_because_the_body_stands_still_are_sound(seed):
 
 
 @pytest.mark.parametrize(("plan", "seed"), [(Plan(seconds=60), 60_017), (replace(planted.ONE, seconds=60), 60_003)])
-def test_reflections_in_the_last_seconds_are_no_change_of_a_delay(plan, seed):
+def test_late_reflections_are_not_a_changed_delay(plan, seed):
     assert faults(fly(plan, seed)) == []
 
 
@@ -268,7 +268,7 @@ def test_reflections_in_the_last_seconds_are_no_change_of_a_delay(plan, seed):
         (SHORT, longer(0.2, lambda f: planted.of_tag(f, 21) & (np.abs(planted.seconds(f) - 20) < 4))),
     ],
 )
-def test_what_is_no_change_of_one_tags_delay_is_not_called_so(plan, plant):
+def test_other_changes_are_not_called_a_changed_delay(plan, plant):
     assert "delay changed mid-flight" not in faults(plant(fly(plan, 98), RNG(3)))
 
 
@@ -281,7 +281,7 @@ def test_a_step_is_named_with_tag_size_and_time():
     assert size_ns == pytest.approx(0.09 / LIGHT * 2e9, abs=0.1)
 
 
-def test_a_drift_is_none():
+def test_a_drift_is_not_called_a_step():
     flight = fly(replace(SHORT, seconds=60), 46)
     drift = 0.15 * planted.seconds(flight) / 60
     drifting = planted.longer(flight, np.where(planted.of_tag(flight, 30), drift, 0.0))
@@ -308,7 +308,7 @@ def test_a_pair_that_does_not_close_is_named_with_its_size(plant, named, size_cm
     assert numbers(found.evidence.split(" are ")[1])[0] == pytest.approx(size_cm, abs=3)
 
 
-def test_pairs_that_a_cabinet_hides_are_named():
+def test_pairs_behind_a_cabinet_are_named():
     """Tag 1 and the third quadcopter have metal between them: medians of their two pairs are 25 and 17 cm too long."""
 
     room = uwbsim.simulate(uwbsim.load("room/room", {"run.duration_s": 60.0, "run.seed": 50_004}))
@@ -332,7 +332,7 @@ def lines_of(finding):
 @pytest.mark.parametrize(
     ("given", "count", "per_second"), [(False, 2, 80), (False, 4, 80), (True, 2, 20), (True, 3, 80)]
 )
-def test_anchors_that_were_exchanged_are_one_finding_with_the_lines_that_mend_it(given, count, per_second):
+def test_exchanged_anchors_are_one_finding_with_the_corrected_lines(given, count, per_second):
     flight = fly(replace(RIG, seconds=60, per_second=per_second), 97)
     wrong = planted.exchanged_anchors(flight, RNG(5), given=given, count=count)
     found = only(wrong, "swapped tag ids")
@@ -364,7 +364,7 @@ def test_tags_of_two_robots_that_were_exchanged_are_named_with_body_and_lever_ar
     ]
 
 
-def test_places_that_the_true_distances_of_a_table_contradict_are_named():
+def test_positions_that_contradict_true_distances_are_named():
     flight = fly(replace(RIG, seconds=60), 97)
     truth_m = calib.Ranges.from_exchanges(flight.exchanges, poses=flight.poses, tags=flight.tags).truth_m
     assert faults(planted.changed(flight, truth_m=truth_m + 0.01)) == ["too few pairs"]
@@ -373,7 +373,7 @@ def test_places_that_the_true_distances_of_a_table_contradict_are_named():
     assert found.evidence.startswith("by the poses, tag 101 is at the given position of 103")
 
 
-def test_true_distances_of_an_anchor_that_is_nobodys_place_are_named():
+def test_true_distances_of_a_displaced_anchor_are_named():
     flight = fly(replace(RIG, seconds=60), 97)
     wrong = with_places(flight, {"anchor2": [3.0, -4.0, 1.0]})
     truth_m = calib.Ranges.from_exchanges(wrong.exchanges, poses=wrong.poses, tags=wrong.tags).truth_m
@@ -382,7 +382,7 @@ def test_true_distances_of_an_anchor_that_is_nobodys_place_are_named():
     assert sorted(re.findall(r"\d+-\d+", found[0].evidence)) == ["10-102", "11-102"]
 
 
-def test_where_anchors_stand_is_told_with_intervals_and_as_lines_of_a_map():
+def test_findings_state_positions_of_anchors_with_intervals_and_as_map_lines():
     """All four anchors are 30 cm off at once."""
     scores = []
     for seed in range(90_100, 90_104):
@@ -402,7 +402,7 @@ def test_where_anchors_stand_is_told_with_intervals_and_as_lines_of_a_map():
     assert np.count_nonzero(np.abs(scores) < 1) >= 43
 
 
-def test_ranges_between_anchors_tell_their_places_too():
+def test_ranges_between_anchors_determine_their_positions():
     """The moving tags determine the direction of an anchor's displacement only to 19 cm."""
 
     flight = uwbsim.simulate(uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.seed": 77_001}))
@@ -416,7 +416,7 @@ def test_ranges_between_anchors_tell_their_places_too():
 
 
 @pytest.mark.parametrize("seed", [77_010, 77_012])
-def test_anchors_that_are_all_off_are_not_taken_for_walls_between_them(seed):
+def test_displaced_anchors_are_not_taken_for_walls(seed):
 
     flight = uwbsim.simulate(uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.seed": seed}))
     off = planted.all_anchors_off(flight, RNG(seed))
@@ -435,7 +435,7 @@ def test_anchors_that_are_all_off_are_not_taken_for_walls_between_them(seed):
 
 
 @pytest.mark.parametrize(("seed", "pair", "either"), [(77_010, (0, 1), True), (77_012, (2, 4), False)])
-def test_a_wall_between_anchors_is_named_and_places_where_they_explain_it(seed, pair, either):
+def test_walls_between_anchors_and_displaced_anchors_are_distinguished(seed, pair, either):
 
     flight = uwbsim.simulate(uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.seed": seed}))
     wall = longer(0.2, lambda f: planted.of_tag(f, pair[0]) & planted.of_tag(f, pair[1]))
@@ -478,7 +478,7 @@ def test_an_anchor_whose_delay_changed_between_sessions_is_named(gap):
     assert f"tag {anchor} " in found.evidence
 
 
-def test_boards_at_one_distance_are_asked_about_the_unit_of_the_tape():
+def test_boards_at_one_distance_have_a_finding_on_the_unit():
     flight = fly(SHORT, 98)
     e = flight.exchanges[(flight.exchanges.initiator == 10) & (flight.exchanges.target == 20)]
     known = calib.Ranges.from_exchanges(e, poses=flight.poses, tags=flight.tags).truth_m
@@ -488,7 +488,7 @@ def test_boards_at_one_distance_are_asked_about_the_unit_of_the_tape():
     assert 'distance = "mm"' in found.remedy
 
 
-def test_reflections_that_last_are_named_with_their_life():
+def test_lasting_reflections_are_named_with_their_duration():
     plan = replace(SHORT, seconds=150, tags_a_body=1, share=0.2, lasts_s=4.0)
     found = only(fly(plan, 55), "reflections that last")
     lives = [float(life) for life in re.findall(r"for ([\d.]+) s at a time", found.evidence)]
@@ -496,7 +496,7 @@ def test_reflections_that_last_are_named_with_their_life():
     assert 1.5 < np.median(lives) < 9
 
 
-def test_a_tag_of_many_reflected_ranges_is_named_where_pairs_have_few():
+def test_a_tag_with_many_reflected_ranges_is_named():
     flight = fly(replace(SHORT, per_second=7, share=0.0), 98)
     reflected = planted.of_tag(flight, 20) & (RNG(1).random(len(flight.exchanges)) < 0.4)
     found = only(planted.longer(flight, np.where(reflected, 0.6, 0.0)), "reflections")

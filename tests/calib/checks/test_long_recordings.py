@@ -38,7 +38,7 @@ def path(flight, tmp_path_factory):
     return write(tmp_path_factory.mktemp("long") / "long.uwb", flight)
 
 
-def test_stretches_are_over_all_of_the_time_and_their_distances_are_those_of_all_poses(flight, path):
+def test_stretches_cover_the_recording_and_have_all_poses(flight, path):
     with Recording.open(path) as recording:
         looked = recording_view.select_part(RecordedSource(recording))
     x, every = looked.exchanges, flight.exchanges
@@ -52,7 +52,7 @@ def test_stretches_are_over_all_of_the_time_and_their_distances_are_those_of_all
     )
 
 
-def test_nothing_is_found_where_nothing_was_planted_and_it_is_said_what_was_looked_at(path):
+def test_sound_recordings_have_no_finding_and_the_examined_part_is_stated(path):
     assert calib.examine(path) == []
     assert examined_part(24_000) == (
         "about 6000 of its 24000 exchanges were examined, in 12 stretches over all of its time"
@@ -60,13 +60,13 @@ def test_nothing_is_found_where_nothing_was_planted_and_it_is_said_what_was_look
 
 
 @pytest.mark.slow
-def test_poses_that_are_late_are_found_by_how_much(flight, tmp_path):
+def test_late_poses_are_found_with_their_delay(flight, tmp_path):
     (finding,) = calib.examine(write(tmp_path / "late.uwb", flight, 400_000_000))
     assert finding.fault == "pose time offset"
     assert "-0.400 s" in finding.evidence or "-0.39" in finding.evidence
 
 
-def test_a_short_recording_is_looked_at_as_a_whole(path, monkeypatch):
+def test_short_recordings_are_examined_completely(path, monkeypatch):
     monkeypatch.setattr(recording_view, "EXAMINED_EXCHANGES", 24_000)
     with Recording.open(path) as recording:
         assert len(recording_view.select_part(RecordedSource(recording)).exchanges) == 24_000

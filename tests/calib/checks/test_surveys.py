@@ -59,7 +59,7 @@ TAPES = KnownDistance(1, 3, 2.1 + 0.3, 0.005, "A"), KnownDistance(2, 4, 2.7, 0.0
     ],
     ids=["sound", "crooked", "moved", "a wrong tape"],
 )
-def test_what_contradicts_a_survey_is_named_and_nothing_else(tmp_path, world, tapes, evidence):
+def test_contradictions_of_a_survey_are_named(tmp_path, world, tapes, evidence):
     found = faults(save(world(), tmp_path / "a.uwb", distances=tapes))
     assert found.keys() == evidence.keys()
     assert all(found[fault].evidence.startswith(text) for fault, text in evidence.items())

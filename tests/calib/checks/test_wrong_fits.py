@@ -54,13 +54,13 @@ def wrong(world, found):
 
 
 @pytest.mark.parametrize("name", sorted(REFUSED))
-def test_what_cannot_be_is_refused(name):
+def test_faults_that_prevent_a_fit_are_refused(name):
     with pytest.raises(calib.UnanswerableError, match=REFUSED[name]):
         calib.fit(planted(name).ranges)
 
 
 @pytest.mark.parametrize("name", sorted(set(PLANTED) - set(REFUSED)))
-def test_no_wrong_delay_without_a_word(name):
+def test_wrong_delays_have_a_warning(name):
     world = planted(name)
     found = calib.fit(world.ranges)
     assert found.warnings or np.abs(wrong(world, found)).max() < 3
@@ -69,7 +69,7 @@ def test_no_wrong_delay_without_a_word(name):
 
 
 @pytest.mark.parametrize("name", ["iid", "share by pair, two kinds", "unequal noise", "share by power"])
-def test_sound_worlds_are_not_doubted(name):
+def test_sound_worlds_have_no_warnings(name):
     for seed in range(2):
         world = make(CLEAN[name], seed)
         found = calib.fit(world.ranges)
@@ -77,7 +77,7 @@ def test_sound_worlds_are_not_doubted(name):
         assert np.abs(wrong(world, found)).max() < 4
 
 
-def test_shares_of_reflections_that_differ_by_pair_do_not_pull_delays():
+def test_shares_of_reflections_by_pair_do_not_bias_delays():
     errors = []
     for seed in range(3):
         world = make(CLEAN["share by pair"], seed)
@@ -88,12 +88,12 @@ def test_shares_of_reflections_that_differ_by_pair_do_not_pull_delays():
     assert np.sqrt(np.mean(np.square(errors))) < 0.010
 
 
-def test_a_recording_too_short_for_its_errors_is_said():
+def test_short_recordings_with_persistent_errors_have_a_warning():
     recipe = Recipe(seconds=20, lasts_s=5, wander_m=0.04, wander_s=10)
     assert [warning for warning in calib.fit(make(recipe, 1).ranges).warnings if "20 s of data" in warning]
 
 
-def test_intervals_hold_where_errors_last():
+def test_intervals_cover_the_truth_if_errors_persist():
     scores = []
     for seed in range(5):
         world = make(CLEAN["persistent 1 s, 2 cm over 3 s, 90 s"], seed)
@@ -112,7 +112,7 @@ def distances_late_by(ranges, seconds):
     return replace(ranges, truth_m=truth)
 
 
-def test_late_motion_capture_is_named_and_not_walls():
+def test_late_motion_capture_is_not_taken_for_walls():
     (said,) = calib.fit(distances_late_by(ranges_with_field(60_003, bodies=3, seconds=60)[0], 0.02)).warnings
     assert "true distances change" in said
     assert "places" not in said
@@ -124,7 +124,7 @@ def test_distances_in_a_wrong_unit_are_named():
     assert any("grow with the distance" in one for one in said)
 
 
-def test_a_sequential_fit_takes_the_curve_for_no_wall():
+def test_sequential_fits_do_not_take_the_curve_for_walls():
     """The errors of all ranges between two bodies contain the curve, which is fitted after the delays."""
     ranges = ranges_with_field(60_005, bodies=3, seconds=60)[0]
     lifted = np.mean(10 ** ((np.array([ranges.fpp1_dbm, ranges.fpp2_dbm]) + 82) / 10), axis=0)
@@ -134,7 +134,7 @@ def test_a_sequential_fit_takes_the_curve_for_no_wall():
 
 
 @pytest.mark.parametrize(("noise_db", "seed", "place"), [(0.3, 101, False), (1.0, 5, True)])
-def test_noise_of_powers_that_follow_the_distance_is_not_called_places_alone(noise_db, seed, place):
+def test_noise_of_powers_is_not_called_places_only(noise_db, seed, place):
     """No error depends on places here; with much noise in the powers, the curve is too flat, which has a similar
     effect.
     """

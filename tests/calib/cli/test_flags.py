@@ -39,7 +39,7 @@ ONLY_FROM_PYTHON = {
 }
 
 
-def test_every_parameter_that_an_error_names_has_its_option():
+def test_parameters_in_errors_have_options():
     named = set()
     for path in (ROOT / "calib").rglob("*.py"):
         named |= set(re.findall(r'(?:parameter=|check_choice\()"([a-z_0-9]+)"', path.read_text()))
@@ -47,13 +47,13 @@ def test_every_parameter_that_an_error_names_has_its_option():
     assert {with_flags(f"`{name}`") for name in named - ONLY_FROM_PYTHON} <= OPTIONS
 
 
-def test_other_text_stays_as_it_is():
+def test_other_text_is_not_changed():
     assert (
         with_flags("a `Path` and -0.5, `minimum_norm` and `fixed_ns`") == "a `Path` and -0.5, --minimum-norm and --fix"
     )
 
 
-def test_settings_know_what_the_curves_know():
+def test_settings_have_the_choices_of_the_curves():
     assert {one.name: set(one.metadata.get("names", ())) for one in fields(FitSettings)}["lift"] == set(LIFTS)
     assert FitSettings().alpha_dbm == ALPHA_DBM
 
@@ -89,7 +89,7 @@ def recording(tmp_path_factory):
     return path
 
 
-def test_a_known_start_is_enough(recording, tmp_path):
+def test_known_positions_at_the_start_are_enough(recording, tmp_path):
     words = ("--truth", "ranges", "--poses-until", 4, "-o", tmp_path / "c.json")
     assert processes.succeed("calib", "fit", recording, *words).stdout.count(" delay ") == 6
     written = json.loads((tmp_path / "c.json").read_text())
@@ -106,7 +106,7 @@ def test_a_known_start_is_enough(recording, tmp_path):
         ("1-3=2±0.02@2..8", KnownDistance(1, 3, 2.0, 0.02, "2..8")),
     ],
 )
-def test_a_distance_is_read_as_one_types_it(text, found):
+def test_distances_are_read_from_options(text, found):
     assert read_distances([text]) == (found,)
 
 
@@ -123,7 +123,7 @@ def test_a_distance_is_read_as_one_types_it(text, found):
         (("--truth", "ranges", "--heights", "guess"), "--heights: found 'guess', allowed: used, ignored"),
     ],
 )
-def test_what_does_not_go_together_is_one_line(recording, tmp_path, words, said):
+def test_contradicting_options_are_refused(recording, tmp_path, words, said):
     processes.refuse("calib", "fit", recording, *words, "-o", tmp_path / "c.json", naming=[said])
     assert not (tmp_path / "c.json").exists()
 
@@ -206,7 +206,7 @@ def stopped(stopped_flight, monkeypatch, tmp_path):
     return processes.run("calib", "fit", stopped_flight, "-o", tmp_path / "c.json"), tmp_path / "c.json"
 
 
-def test_the_command_writes_it_marks_it_and_ends_with_1(stopped, stopped_flight, tmp_path):
+def test_stopped_fits_are_marked_and_have_status_1(stopped, stopped_flight, tmp_path):
     done, path = stopped
     assert "stopped after" in done.stdout
     assert "before it converged" in done.stderr
@@ -217,7 +217,7 @@ def test_the_command_writes_it_marks_it_and_ends_with_1(stopped, stopped_flight,
         assert json.loads(text)["provenance"]["converged"] is False
 
 
-def test_commands_that_use_it_warn(stopped, stopped_flight, tmp_path):
+def test_commands_warn_of_stopped_fits(stopped, stopped_flight, tmp_path):
     path = stopped[1]
     for words in (
         ("apply", stopped_flight, "-c", path, "-o", tmp_path / "corrected.uwb"),
@@ -229,7 +229,7 @@ def test_commands_that_use_it_warn(stopped, stopped_flight, tmp_path):
     assert "NOT CONVERGED" in run("calib", "show", path).stdout
 
 
-def test_a_fit_that_settled_is_quiet(stopped_flight, tmp_path):
+def test_converged_fits_have_no_warning(stopped_flight, tmp_path):
     fitted = run("calib", "fit", stopped_flight, "-o", tmp_path / "c.json")
     applied = run("calib", "apply", stopped_flight, "-c", tmp_path / "c.json", "-o", tmp_path / "d.uwb")
     assert "before it converged" not in fitted.stderr + applied.stderr

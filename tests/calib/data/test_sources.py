@@ -57,7 +57,7 @@ def test_a_file_an_open_recording_and_an_object_are_the_same(path):
     assert_same(both[:900], from_file)
 
 
-def test_every_function_takes_what_a_fit_takes(tmp_path):
+def test_every_function_accepts_the_sources_of_a_fit(tmp_path):
     in_memory = sample_flight(300)
     path = written(tmp_path / "sample.uwb", in_memory, in_memory.meta["planted"])
     from_file = calib.fit([path])
@@ -74,7 +74,7 @@ def test_every_function_takes_what_a_fit_takes(tmp_path):
     np.testing.assert_allclose(away - away.mean(), 0, atol=0.02)
 
 
-def test_a_strangers_object_will_do():
+def test_objects_with_the_attributes_of_a_source_are_read():
     """An object of another class, with only the attributes that a source needs."""
     flight = sample_flight()
     bare = SimpleNamespace(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags)
@@ -98,12 +98,12 @@ def test_exchanges_with_their_distances_need_no_poses():
 
 
 @pytest.mark.parametrize("data", [None, 3, [], [None], {"a": 1}])
-def test_what_is_no_recording_is_refused(data):
+def test_other_objects_than_recordings_are_refused(data):
     with pytest.raises((calib.BadInputError, FileNotFoundError)):
         load_ranges(data)
 
 
-def test_ranges_are_not_enough_to_localize_or_examine():
+def test_localizing_and_examining_refuse_ranges():
     flight = load_ranges(sample_flight())
     known = calib.fit(flight).calibration
     for call in (lambda: calib.examine(flight), lambda: calib.localize(flight, known)):
@@ -146,7 +146,7 @@ def test_a_flight_has_its_poses(path):
     assert found.tags == load_flight(sample_flight()).tags
 
 
-def test_poses_without_tags_are_said_to_lack_them():
+def test_the_error_for_poses_without_tags_names_tags():
     flight = sample_flight()
     bare = replace(flight, tags=[], exchanges=replace(flight.exchanges, truth_m=flight.exchanges.truth_m * np.nan))
     with pytest.raises(calib.UnanswerableError, match=r"it has no tags with bodies and lever arms; .*--tags"):
@@ -156,7 +156,7 @@ def test_poses_without_tags_are_said_to_lack_them():
 SPLINE = {"knots": [0, 0, 1, 1], "degree": 1, "coefficients": [0.0, 0.1]}
 
 
-def test_planted_values_have_their_form(tmp_path):
+def test_planted_values_of_wrong_form_are_refused(tmp_path):
     flight = sample_flight(10)
     assert load_ranges(replace(flight, meta={"planted": {"bias_curve": SPLINE, "sigma_curve": None}})).planted
     wrong: list[dict[str, Any]] = [
@@ -192,7 +192,7 @@ def test_poses_without_time_or_body_are_refused(tmp_path):
             load_ranges(place)
 
 
-def test_bodies_with_one_pose_do_not_split_what_is_read(tmp_path):
+def test_bodies_with_one_pose_do_not_split_reading(tmp_path):
     """A hundred anchors have one pose each: thousands of exchanges are read in one part, not one by one."""
     flight = sample_flight(3000)
     path = written(tmp_path / "it.uwb", flight, {})
@@ -253,7 +253,7 @@ def planted_difference(result, loaded):
 
 @pytest.mark.parametrize("form", [lambda f: f, pa.table, lambda f: OfAnotherLibrary(pa.table(f))])
 @pytest.mark.filterwarnings("ignore:.*ids are words")
-def test_a_frame_is_read_with_its_columns_in_words_of_their_owner(form):
+def test_frames_are_read_by_a_map(form):
     whole = frame(gt_range_m=1000 * frame().gt_range_m)
     loaded = calib.Ranges.from_dataframe(form(whole), MAP)
     assert len(loaded) == N
@@ -263,7 +263,7 @@ def test_a_frame_is_read_with_its_columns_in_words_of_their_owner(form):
     assert np.diff(loaded.time_ns) == pytest.approx(50_000_000)
 
 
-def test_a_frame_with_plain_names_needs_no_map_and_says_what_it_assumed():
+def test_frames_with_plain_names_need_no_map_and_note_assumptions():
     plain = frame().rename(columns={"distance_mm": "range_m"})
     plain["range_m"] /= 1000
     with pytest.warns(UserWarning, match="3 ids are words"):
@@ -305,13 +305,13 @@ def test_a_frame_with_plain_names_needs_no_map_and_says_what_it_assumed():
         ),
     ],
 )
-def test_a_frame_that_does_not_tell_everything_is_refused_with_what_is_missing(tmp_path, call, error, said):
+def test_incomplete_frames_are_refused_with_the_missing_data(tmp_path, call, error, said):
     with pytest.raises(error, match=said):
         call(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_ranges_and_true_distances_that_are_both_in_millimetres_are_refused():
+def test_ranges_and_true_distances_in_millimetres_are_refused():
     rng, pair = np.random.default_rng(5), np.array([(1, 2), (1, 3), (2, 3)])[np.arange(N) % 3]
     truth_mm = rng.uniform(1000, 6000, N)
     ranges = calib.Ranges.from_arrays(
@@ -342,7 +342,7 @@ def test_results_become_frames():
     assert flight.exchanges.to_pandas().range_m.to_numpy() == pytest.approx(flight.exchanges.range_m)
 
 
-def test_without_pandas_one_line_says_what_to_do(monkeypatch):
+def test_without_pandas_the_error_names_the_package_to_install(monkeypatch):
     real = builtins.__import__
 
     def missing(name, *args, **kwargs):
@@ -393,11 +393,11 @@ def exchanges(stamps_ppm=None, sign=1.0, noise_ppm=0.3):
     ],
     ids=["they agree", "they agree by the other sign", "readings of zero are none", "readings scatter widely"],
 )
-def test_clocks_that_agree_or_of_which_readings_prove_nothing_are_left_alone(some):
+def test_clocks_that_agree_have_no_finding(some):
     assert clocks_apart(some) is None
 
 
-def test_a_clock_that_only_the_stamps_find_fast_is_named_with_what_it_does():
+def test_a_clock_that_is_fast_by_stamps_only_is_named_with_its_effect():
     # Tag 3 is 3 ppm slow; by its stamps it is 2 ppm fast.
     some = exchanges(stamps_ppm=(4.0, -3.0, 6.5))
     found = clocks_apart(some)

@@ -23,7 +23,7 @@ def sampled(information, slope, typical, rng):
 
 
 @pytest.mark.parametrize("planted_m", [0.0, 0.02, 0.1])
-def test_variance_is_the_mean_of_its_posterior(planted_m):
+def test_variances_are_means_of_their_posterior(planted_m):
     rng = np.random.default_rng(5)
     information = rng.uniform(300, 3000, 8)
     values = rng.normal(0, np.hypot(planted_m, information**-0.5))
@@ -32,18 +32,18 @@ def test_variance_is_the_mean_of_its_posterior(planted_m):
     assert found == pytest.approx(sampled(information, values * information, 0.035, rng), rel=0.03)
 
 
-def test_draws_of_which_nothing_is_known_have_the_typical_variance():
+def test_draws_without_information_have_the_typical_variance():
     assert mean_variance(np.zeros(4), np.zeros(4), 0.035, BOUNDS) == pytest.approx(0.035**2, rel=0.01)
 
 
-def test_two_recordings_of_a_sound_world_show_no_difference_and_one_cannot():
+def test_recordings_of_a_sound_world_do_not_differ():
     first, second = (make(CLEAN["iid"], 31, flight).ranges[::2] for flight in (0, 1))
     assert calib.fit(first).calibration.errors.between_m == 0.05
     later = replace(second, time_ns=second.time_ns + 86_400 * 10**9, source="later")
     assert calib.fit([first, later]).calibration.errors.between_m < 0.01
 
 
-def test_what_is_said_of_other_recordings_is_in_the_total_and_what_is_not_is_refused():
+def test_between_m_is_in_the_total_sigma_and_checked():
     ranges = make(CLEAN["three tags"], 32).ranges[::3]
     plain, stated = (calib.fit(ranges, between_m=value).calibration for value in (0.0, 0.05))
     totals = [each.apply(ranges).sigma_total_m for each in (plain, stated)]
@@ -53,7 +53,7 @@ def test_what_is_said_of_other_recordings_is_in_the_total_and_what_is_not_is_ref
         calib.fit(ranges, between_m=-1.0)
 
 
-def test_quiet_and_noisy_pairs_differ_between_recordings_by_as_much():
+def test_between_m_is_equal_for_pairs_with_little_and_much_noise():
     ranges = make(CLEAN["unequal noise"], 33).ranges[::3]
     plain, stated = (calib.fit(ranges, between_m=value).calibration for value in (0.0, 0.05))
     lifted = np.full(len(ranges), np.median(plain.errors.lifted))

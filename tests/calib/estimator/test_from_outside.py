@@ -40,13 +40,13 @@ def climbed():
     return climb
 
 
-def test_one_more_unknown_is_one_unknown_and_one_part(climbed):
+def test_a_new_unknown_needs_one_unknown_and_one_part(climbed):
     value, std = climbed(0.0, 1e6)
     assert std < 0.0003
     assert value == pytest.approx(PER_KELVIN_M, abs=4 * std)
 
 
-def test_one_more_kind_of_row_is_one_class(climbed):
+def test_a_new_kind_of_row_needs_one_class(climbed):
     alone, std = climbed(0.0, 1e6)
     value, both = climbed(0.003, std)
     # Sheet and ranges have equal weight: the result is halfway, and its deviation is smaller by the root of two.
@@ -54,7 +54,7 @@ def test_one_more_kind_of_row_is_one_class(climbed):
     assert both == pytest.approx(std / np.sqrt(2), rel=0.1)
 
 
-def test_least_squares_with_delays_alone_is_numpys():
+def test_least_squares_with_delays_alone_agrees_with_numpy():
     model = model_of(make(CLEAN["short, 30 s"], 12_002).ranges, FitSettings(delays_only=True))
     error = model.ranges.raw_m - model.ranges.truth_m
     found = robust_fit(model, error, "l2", None, ("delay",))

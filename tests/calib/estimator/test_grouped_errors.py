@@ -40,7 +40,7 @@ def test_the_parts_of_errors_are_found(planted):
     assert (found.centre_m - 0.03) / found.centre_std_m == pytest.approx([0, 0], abs=3)
 
 
-def test_groups_of_unlike_noise_do_not_blur_each_other():
+def test_groups_with_different_noise_are_separate():
     rng = np.random.default_rng(7)
     found = fit_grouped_errors([sigma * rng.normal(size=20_000) + k for k, sigma in enumerate((0.02, 0.2, 0.2))])
     np.testing.assert_allclose(found.sigma_m, [0.02, 0.2, 0.2], rtol=0.02)
@@ -82,7 +82,7 @@ def test_noise_is_that_of_restricted_likelihood_however_many_offsets_there_are(s
     assert maximize([rows], Priors(layout), layout.start(), evidence_steps=0).of("noise")[0] < best - 0.03
 
 
-def test_noise_is_larger_by_the_share_that_other_unknowns_use_up():
+def test_noise_accounts_for_other_unknowns():
     rng = np.random.default_rng(1)
     kinds = VALUES | {"long": -30.0, RESIDUAL: 0.0}
     layout = Layout(tuple(Unknown(kind=kind, names=("",), start=np.array([at])) for kind, at in kinds.items()))

@@ -22,7 +22,7 @@ def fitted(recipe, seed=12_003, **settings):
     return fit_known_distances(make(recipe, seed).ranges, calib.FitSettings(**settings))
 
 
-def test_what_a_fit_uses_of_the_data_is_given_back():
+def test_variances_account_for_fitted_unknowns():
     model = model_of(make(CLEAN["short, 30 s"], 12_004).ranges[:400], calib.FitSettings(delays_only=True))
     found = robust_fit(model, model.ranges.raw_m - model.ranges.truth_m, "l2", None, ("delay",))
     delays = found.optimum.layout.indices(["delay"])
@@ -56,13 +56,13 @@ def test_reflections_covariance_of_other_detours_are_in_the_intervals(monkeypatc
     assert many > max(20 * few, 2e-8, 0.1 * traces[0.3, False])
 
 
-def test_offsets_of_pairs_are_unknowns_where_anything_tells_them_from_delays():
+def test_offsets_of_pairs_are_fitted_if_they_are_identifiable():
     assert "offset of pair" in fitted(CLEAN["short, 30 s"]).values
     assert "offset of pair" not in fitted(Recipe(tags=3, seconds=20)).values
     assert "offset of pair" not in fitted(CLEAN["short, 30 s"], constants="pair").values
 
 
-def test_intervals_of_few_ranges_hold():
+def test_intervals_of_few_ranges_cover_the_truth():
     scores = []
     for seed in range(12):
         some = synthetic.ranges(n=100, noise_m=0.05, tail=0, seed=seed)

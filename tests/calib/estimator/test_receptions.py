@@ -29,7 +29,7 @@ def by_tag(found):
     return np.array([[c[tag] for tag in names] for c in (found.calibration.delays_ns, found.calibration.delays_std_ns)])
 
 
-def test_each_listener_alone_finds_each_targets_delay_without_noise():
+def test_each_listener_determines_each_delay_of_a_target():
     world = load(SCENARIOS / "noiseless.toml", ["run.duration_s=60", *(f"tags.{k}.passive=true" for k in range(6))])
     found = simulate(world)
     ranges = calib.load_ranges(found, need_power=False)
@@ -45,7 +45,7 @@ def test_each_listener_alone_finds_each_targets_delay_without_noise():
 
 
 @pytest.mark.slow
-def test_listeners_gain_what_theory_predicts_and_intervals_hold():
+def test_the_gain_by_listeners_agrees_with_theory():
     pairs = [(i, j) for i in range(6) for j in range(6) if i != j]
     alone, bound = (np.sqrt(np.diag(bound_ns2(pairs, 6, listening=on)).mean()) for on in (False, True))
     assert bound / alone == pytest.approx(0.764, abs=0.01)
@@ -78,7 +78,7 @@ def test_intervals_hold_among_reflections_with_a_curve():
 
 
 @pytest.mark.parametrize("listener", [1, 4])
-def test_one_listener_determines_what_anchors_and_robots_leave_free(listener):
+def test_one_listener_determines_the_split_of_anchors_and_robots(listener):
     data, planted = flight(7200, tags=5, pairs=ROBOTS_AND_ANCHORS, listeners=[listener])
     without = calib.fit(data, delays_only=True)
     assert without.calibration.undetermined_splits == (((0, 4), (1, 2, 3)),)
@@ -104,7 +104,7 @@ def test_recordings_are_fitted_together_with_what_each_overheard():
     assert kept.raw_m[kept.arrivals.exchange] == pytest.approx(alone.raw_m[alone.arrivals.exchange])
 
 
-def test_a_listener_that_stands_elsewhere_is_named():
+def test_a_listener_at_a_wrong_place_is_named():
     data, _ = flight(7400)
     heard = data.overheard
     # Tag 9 only listens, at the place of tag 2; its stated position is that, or 10 cm beside it.
@@ -152,12 +152,12 @@ def test_two_messages_take_the_rate_from_the_carrier():
         ({}, {"use": "everything"}, calib.BadInputError, "allowed: exchanges, receptions"),
     ],
 )
-def test_what_cannot_be_fitted_is_refused(change, settings, error, said):
+def test_receptions_that_cannot_be_fitted_are_refused(change, settings, error, said):
     with pytest.raises(error, match=said):
         calib.fit(replace(flight(7500, count=300)[0], **change), **{"use": "receptions"} | settings)
 
 
-def test_the_command_says_how_many_were_fitted(tmp_path):
+def test_the_command_prints_the_number_of_differences(tmp_path):
     data, _ = flight(7600, count=400)
     data.save(tmp_path / "f.uwb")
     words = ("calib", "fit", tmp_path / "f.uwb", "-o", tmp_path / "c.json", "--use", "receptions", "--delays-only")

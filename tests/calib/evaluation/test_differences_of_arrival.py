@@ -66,7 +66,7 @@ def heard():
 PLANTED = calibration(DELAYS_NS, 0.005)
 
 
-def test_one_row_is_that_of_a_page_of_numpy(known, heard):
+def test_one_row_agrees_with_numpy(known, heard):
     x, h, row = heard.exchanges, heard.overheard, 1234
     ranges = calib.load_ranges(heard)
     found = known.correct_arrivals(ranges)
@@ -135,7 +135,7 @@ def test_a_robot_that_never_sends_is_localized(known, heard):
 
 
 @pytest.mark.slow
-def test_the_filter_knows_what_listeners_of_an_exchange_share(heard):
+def test_the_filter_includes_common_errors_of_listeners(heard):
     (problem,), rng = problems(load_flight(heard)), np.random.default_rng(5)
     true_m = problem.ranges.arrivals.truth_m[problem.rows - len(problem.ranges)]
     drawn = 0.3 * rng.normal(size=len(problem.ranges))[problem.exchange] + 0.05 * rng.normal(size=len(true_m))
@@ -165,7 +165,7 @@ def test_constants_of_both_pairs_in_a_difference_are_followed(heard):
     assert min(track.offsets[-1] for track in tracks["own"]) > 0.99
 
 
-def test_a_wrong_start_is_left_by_differences_alone(known):
+def test_differences_alone_correct_a_wrong_start(known):
     settings = replace(LISTEN, initial_offset_m=(0.0, -8.0, 0.0), seeds=1)
     (found,) = calib.localize(flight(3104, 4.0), known, settings)
     for track in found.tracks.values():
@@ -207,7 +207,7 @@ def test_a_robot_on_board_is_helped_by_what_is_overheard(known, tmp_path):
 
 
 @pytest.mark.slow
-def test_reflections_that_last_and_pass_the_gate_are_counted():
+def test_lasting_reflections_within_the_gate_are_in_the_covariance():
     """A gate of 3.3 standard deviations of a difference accepts errors of half a metre of both signs."""
     lasting = {"model": "two-state", "share": 0.14, "mean_excess_m": 0.35, "life_s": 0.15, "first_path_loss_db": 0.4,
                "loss_std_db": 1.0, "total_loss_db": 0.0}  # fmt: skip
@@ -255,7 +255,7 @@ def folder(tmp_path_factory):
         ("listens", "--use everything", 2, ["--use", "everything", "exchanges, receptions"]),
     ],
 )
-def test_one_line_says_what_to_do(folder, robot, options, status, naming):
+def test_errors_are_one_line_with_the_remedy(folder, robot, options, status, naming):
     words = f"calib localize {robot}.uwb -c c.json --tum tum {options}".split()
     processes.refuse(*words, cwd=folder, naming=naming, status=status)
     assert not (folder / "tum").exists()

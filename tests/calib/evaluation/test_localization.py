@@ -77,14 +77,14 @@ def test_a_body_that_ranges_only_where_its_place_is_unknown_is_left_out(flights)
 
 
 @pytest.mark.slow
-def test_a_filter_that_trusts_its_ranges_too_much_is_found_out(flights):
+def test_overconfident_filters_are_detected(flights):
     flight, known = clean(beginning(flights["test1"], 20))
     found = summarize(localize(flight, replace(known, sigma_curve=constant_curve(0.05)), Settings(gate=1e9, seeds=1)))
     assert found.nis > found.nis_bounds[1]
     assert found.nees > found.nees_bounds[1]
 
 
-def test_what_cannot_be_localized_or_summed_up(flights):
+def test_localization_without_data_is_refused(flights):
     flight, known = clean(beginning(flights["test1"], 1))
     with pytest.raises(UnanswerableError, match="ifo001"):
         summarize(localize(flight, known, Settings(gate=1e-12, seeds=1)))
@@ -94,7 +94,7 @@ def test_what_cannot_be_localized_or_summed_up(flights):
 
 
 @pytest.mark.slow
-def test_a_calibration_is_worth_at_least_a_third_of_the_error(flights, fitted):
+def test_a_calibration_reduces_the_error_by_a_third(flights, fitted):
     flight = beginning(flights["test1"], 20)
     found = localize(flight, fitted, Settings(seeds=2))
     assert len(found) == 3
@@ -156,7 +156,7 @@ def test_a_wrong_start_is_left_within_two_seconds(flights, fitted, offset):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("far_m", "offset"), [(3.0, (0.0, -10.0, 0.0)), (10.0, (0.0, 0.0, 5.0))])
-def test_wrong_ranges_do_not_lock_the_filter_out(flights, far_m, offset):
+def test_the_filter_recovers_after_wrong_ranges(flights, far_m, offset):
     flight, known = clean(beginning(flights["test1"], 12))
     # The ranges are wrong by metres with a stated decimetre, and the start agrees with no range. The gate rejects all
     # ranges until the filter restarts, first at the position of the wrong ranges, then at that of the right ones.
@@ -172,7 +172,7 @@ def test_wrong_ranges_do_not_lock_the_filter_out(flights, far_m, offset):
 
 
 @pytest.mark.parametrize(("name", "value"), [("velocity_std_mps", 0.0), ("gate", float("nan")), ("seeds", 0)])
-def test_settings_that_no_filter_can_run_with(name, value):
+def test_wrong_settings_of_filters_are_refused(name, value):
     with pytest.raises(BadInputError) as caught:
         Settings(**{name: value})
     assert caught.value.parameter == name
@@ -205,7 +205,7 @@ def test_recordings_of_one_name_keep_their_own_trajectories(tmp_path):
     assert (tmp_path / raw[0]).read_text() != (tmp_path / raw[1]).read_text()
 
 
-def test_bars_say_where_they_leave_bodies_out(flights, fitted):
+def test_figures_state_omitted_bodies(flights, fitted):
     found = localize(beginning(flights["test1"], 1), fitted, Settings(seeds=1))
     with style():
         (few,), (most,) = (rmse_bars(3.5, some).axes for some in (found, 2 * found))
@@ -258,7 +258,7 @@ def test_mean_and_variance_of_the_noise_are_those_of_draws(draws, value):
     assert np.exp(update.log_density[0]) == pytest.approx(count / COUNT / 0.02, rel=4 / np.sqrt(count) + 0.03)
 
 
-def test_innovations_out_of_reach_are_finite_and_not_believed():
+def test_extreme_innovations_are_finite_and_rejected():
     update = mixture_update(np.array([-50.0, 1e3, 1e5]), np.full(3, STD**2), ERRORS)
     assert not update.believed.any()
     assert np.isfinite(update.noise_m).all()
@@ -266,13 +266,13 @@ def test_innovations_out_of_reach_are_finite_and_not_believed():
     np.testing.assert_allclose(update.variance_m2, STD**2, rtol=1e-6)
 
 
-def test_a_gate_takes_all_or_nothing():
+def test_a_gate_accepts_or_rejects():
     update = gated_update(np.array([0.2, 0.4]), np.full(2, 0.01), 9.0)
     assert (update.believed.tolist(), update.noise_m.tolist()) == ([True, False], [0.2, 0.0])
     assert update.variance_m2.tolist() == [0.0, 0.01]
 
 
-def test_what_is_known_of_reflections_is_that_of_all_their_histories():
+def test_probabilities_of_reflections_agree_with_all_histories():
     """Compared with a sum over all histories of a renewal process, with densities by SciPy."""
     share, renewal_s, steps_s = 0.3, 0.5, np.array([0.0, 0.1, 0.05, 0.6, 0.02])
     innovation = np.array([0.05, 0.4, 0.9, 0.02, 0.25])
@@ -295,7 +295,7 @@ def test_what_is_known_of_reflections_is_that_of_all_their_histories():
 
 
 @pytest.mark.slow
-def test_reflections_that_last_do_not_lead_the_filter_astray():
+def test_lasting_reflections_do_not_mislead_the_filter():
     """Between metal racks, half of the ranges of a body are metres too long, for seconds on end; 3 is right.
 
     A filter that assumes independent ranges of a pair has a NEES of 24 here, and an error of 20 cm.

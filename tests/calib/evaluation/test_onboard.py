@@ -164,7 +164,7 @@ def test_imu_height_and_ranges_find_place_and_heading():
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_it_knows_how_good_it_is(seed):
+def test_the_filter_is_consistent(seed):
     (track,) = localize_onboard(flight(seed=seed), calibration(), OnboardSettings(noise=IMU))
     late = track.time_ns > track.time_ns[0] + 5_000_000_000
     # Errors of the state last for a second: fifteen independent values of three, whose mean square is known to 15 %.
@@ -189,7 +189,7 @@ def test_a_wrong_start_is_left_within_two_seconds(model, away):
     assert errors_of(track, 2.0).max() < (0.5 if model == "imu" else 0.7)
 
 
-def test_a_velocity_that_lasts_does_without_an_imu():
+def test_the_constant_velocity_model_needs_no_imu():
     contents = flight(12.0, reflected=0.1)
     settings = OnboardSettings(model="constant-velocity")
     (track,) = localize_onboard(replace(contents, imu={}), calibration(0.1), settings)
@@ -201,7 +201,7 @@ def test_a_velocity_that_lasts_does_without_an_imu():
     assert np.sqrt(np.mean(errors_of(blind, 2.0) ** 2)) < 0.35
 
 
-def test_no_truth_is_needed(tmp_path):
+def test_localization_needs_no_true_poses(tmp_path):
     contents = flight(5.0)
     still = np.char.startswith(contents.poses.body, "anchor")
     replace(contents, poses=contents.poses[still]).save(tmp_path / "f.uwb")
@@ -259,7 +259,7 @@ def test_patterns_are_corrected_by_the_estimated_pose():
     np.testing.assert_array_equal(alone.estimate_m, corrected.estimate_m)
 
 
-def test_without_a_heading_a_pattern_is_noise():
+def test_without_a_heading_patterns_count_as_noise():
     turned, known = with_patterns(flight(10.0, seed=5), 0.25)
     settings = OnboardSettings(model="constant-velocity")
     (unsure,), (sure,) = (localize_onboard(turned, one, settings) for one in (known, calibration()))
@@ -289,14 +289,14 @@ FEW = [f"anchor{k}" for k in range(4)]
         (lambda _: {}, {"start_m": (0.0, np.nan, 1.0)}, BadInputError, "`start_m`"),
     ],
 )
-def test_what_cannot_be_localized(change, settings, error, said):
+def test_recordings_without_needed_data_are_refused(change, settings, error, said):
     contents = flight(3.0)
     with pytest.raises(error, match=said):
         localize_onboard(replace(contents, **change(contents)), calibration(), OnboardSettings(**settings))
 
 
 @pytest.mark.parametrize("seed", [41, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (42, 43))])
-def test_a_body_that_only_listens_knows_where_it_is_and_how_well(seed):
+def test_a_body_that_only_listens_is_localized_consistently(seed):
     settings = OnboardSettings(noise=IMU, use="receptions")
     (track,) = localize_onboard(listening(seed=seed), calibration(), settings)
     assert track.used == "differences of arrival, imu, height"
@@ -311,7 +311,7 @@ def test_a_body_that_only_listens_knows_where_it_is_and_how_well(seed):
     assert track.restarts_s == ()
 
 
-def test_differences_need_neither_truth_nor_what_they_do_not_hold():
+def test_differences_need_no_true_poses():
     heard = listening(8.0)
     blind = replace(heard, poses=heard.poses[heard.poses.body != "drone"])
     settings = OnboardSettings(noise=IMU, use="receptions")

@@ -60,7 +60,7 @@ def test_the_command_compares_states_with_fixed_delays_and_prints_their_end(know
     assert re.search(r"they drift with a probability of \d+ % at the end, \d+ % on average", text)
 
 
-def test_constants_of_pairs_have_no_delays_to_follow(tmp_path):
+def test_calibrations_with_constants_of_pairs_are_refused(tmp_path):
     flight(9, 10.0)[0].save(tmp_path / "a.uwb")
     fit(tmp_path / "a.uwb", constants="pair").save(tmp_path / "pairs.json")
     refuse("calib", "localize", tmp_path / "a.uwb", "-c", tmp_path / "pairs.json", "--online", naming=["of pairs"])
@@ -96,7 +96,7 @@ def test_a_drift_of_2_cm_a_kelvin_over_10_kelvin_is_followed(known):
 
 
 @pytest.mark.slow
-def test_where_nothing_drifts_the_filter_is_as_good_as_with_fixed_delays(known):
+def test_without_drifts_the_filter_is_as_accurate_as_with_fixed_delays(known):
     found = [localize(flight(k)[0], known, Settings(seeds=1, online=True))[0] for k in (4, 5, 6)]
     online, fixed = (np.mean([one.tracks[name].rmse_m for one in found]) for name in ("online", "robust"))
     # The cost of a walk that does not exist is 2 to 5 %; its lower likelihood is noticed within seconds.
@@ -105,7 +105,7 @@ def test_where_nothing_drifts_the_filter_is_as_good_as_with_fixed_delays(known):
 
 
 @pytest.mark.slow
-def test_delays_may_begin_to_drift_late(known):
+def test_late_drifts_are_followed(known):
     found, _ = flight(14, 60.0, rate_hz=50)
     ranges, after_s = found.exchanges, 1e-9 * (found.exchanges.time_ns - found.exchanges.time_ns[0]) - 30
     more_m = 0.1 * np.clip(after_s / 20, 0, 1) * ((ranges.initiator == 1) | (ranges.target == 1))

@@ -54,14 +54,14 @@ def test_constants_of_pairs_are_followed(known):
 
 
 @pytest.mark.slow
-def test_without_constants_the_filter_is_as_good_as_one_that_has_none(known):
+def test_without_constants_of_pairs_the_filter_is_as_accurate(known):
     flights = [flight(seed, 40.0)[0] for seed in (31, 32, 33, 34)]
     own, fixed = ([robust(one, by) for one in flights] for by in (known, without(known)))
     assert np.mean([one.rmse_m for one in own]) < 1.005 * np.mean([one.rmse_m for one in fixed])
     assert np.mean([one.offsets.mean() for one in own]) < 0.2
 
 
-def test_the_command_says_that_pairs_differ(known, tmp_path):
+def test_the_command_reports_that_pairs_differ(known, tmp_path):
     known.save(tmp_path / "known.json")
     for name, offset_m in (("same", 0.0), ("differs", OFFSET_M)):
         flight(41, 4.0, offset_m=offset_m)[0].save(tmp_path / f"{name}.uwb")

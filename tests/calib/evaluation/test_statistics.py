@@ -42,7 +42,7 @@ def test_errors_are_split_into_within_and_between_pairs_and_sessions(pairs_m, se
     assert found.between_sessions_m == pytest.approx(sessions_m, abs=0.008)
 
 
-def test_the_planted_calibration_is_found_beside():
+def test_evaluations_compare_with_planted_values():
     from scipy.interpolate import make_interp_spline
 
     grid = np.linspace(-0.5, 2.5, 60)
@@ -106,7 +106,7 @@ def test_a_figure_has_the_errors_of_each_pair_and_of_many_pairs_the_farthest(fou
     assert names == [f"1-{k}" for k in range(6, 30)]
 
 
-def test_one_more_column_is_one_row(monkeypatch):
+def test_a_new_column_needs_one_row(monkeypatch):
     row = ("full", "95 % |e|", "quantile of absolute errors", lambda group: f"{group.full.abs95_m:.3f}")
     monkeypatch.setattr(statistics, "ERROR_COLUMNS", (*statistics.ERROR_COLUMNS, row))
     flight = calib.load_ranges(calib.sample_flight())
@@ -133,7 +133,7 @@ def test_a_part_that_is_held_out_judges_a_fit_to_the_others():
     assert "held_out" not in plain.provenance
 
 
-def test_what_is_held_out_was_not_fitted():
+def test_held_out_ranges_are_not_fitted():
     """A constant of 20 cm in the last tenth of the time is fully visible to a fit without that tenth."""
     flight = calib.load_ranges(calib.sample_flight(3000))
     late = flight.time_ns > np.quantile(flight.time_ns, 0.9)
@@ -154,7 +154,7 @@ def test_what_is_held_out_was_not_fitted():
         ({"hold_out": 0.3, "fold": "session"}, calib.UnanswerableError),  # it has one session
     ],
 )
-def test_settings_that_hold_nothing_out(changes, error):
+def test_wrong_settings_of_held_out_ranges_are_refused(changes, error):
     with pytest.raises(error, match=[*changes][-1]):
         calib.fit(calib.sample_flight(), **changes)
 
@@ -162,7 +162,7 @@ def test_settings_that_hold_nothing_out(changes, error):
 # Evaluating a calibration on its fitted recording gives a warning.
 
 
-def test_the_recording_is_known_by_what_it_holds_and_not_by_its_name(tmp_path):
+def test_recordings_are_identified_by_content(tmp_path):
     train, test = calib.sample_flight(), calib.sample_flight(seed=2)
     for folder, flight in (("a", train), ("b", test), ("c", train)):
         (tmp_path / folder).mkdir()

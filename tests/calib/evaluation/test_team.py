@@ -223,7 +223,7 @@ LISTEN = calib.TeamSettings(use="receptions", noise=IMUS["industrial"])
 
 
 @pytest.mark.slow
-def test_three_quadcopters_know_where_the_others_are_and_how_well(known):
+def test_relative_poses_of_three_quadcopters_are_consistent(known):
     """Three flights as in the paper, with seeds that were chosen before."""
     heard = [one for seed in (301, 302, 303) for one in calib.localize_team(simulated(seed, 12.0), known, LISTEN)]
     assert [(one.body, one.reference) for one in heard] == 3 * [("robot2", "robot1"), ("robot3", "robot1")]
@@ -248,7 +248,7 @@ def test_three_quadcopters_know_where_the_others_are_and_how_well(known):
 
 
 @pytest.mark.slow
-def test_poses_after_the_start_only_judge(known):
+def test_poses_after_the_start_are_only_for_evaluation(known):
     whole = simulated(304, 0.8)
     off = np.array([5.0, -3.0, 1.0]) * (whole.poses.body == "robot2")[:, None] * (whole.poses.time_ns > 3e8)[:, None]
     elsewhere = replace(whole, poses=replace(whole.poses, position_m=whole.poses.position_m + off))
@@ -266,7 +266,7 @@ def test_poses_after_the_start_only_judge(known):
 
 
 @pytest.mark.parametrize("seeds", [(305,), pytest.param((305, 306), marks=pytest.mark.slow)], ids=len)
-def test_the_filter_knows_what_listeners_of_an_exchange_share(known, monkeypatch, seeds):
+def test_the_filter_includes_common_errors_of_listeners(known, monkeypatch, seeds):
     def drawn(ranges, *_, **__):
         rng, heard, count = np.random.default_rng(8), ranges.arrivals, len(ranges)
         truth, nothing = np.append(ranges.truth_m, heard.truth_m), 0 * distances_in(ranges)[1]

@@ -104,19 +104,19 @@ SOUND = {
 
 @pytest.mark.parametrize("seed", [21, pytest.param(22, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("recipe", SOUND.values(), ids=SOUND)
-def test_sound_flights_have_no_pattern(recipe, seed):
+def test_sound_flights_get_no_pattern(recipe, seed):
     found = fitted(recipe, seed).calibration
     assert (found.patterns, json.loads(found.to_json())["schema_version"] < 6) == ((), True)
 
 
-def test_what_belongs_to_places_does_not_pass_for_the_antennas():
+def test_errors_by_position_are_not_taken_for_patterns():
     # A robot that heads along its loop sees every wall in one direction. A requested pattern remains small.
     (pattern,) = fitted(replace(SOUND["errors of places"], room_m=0.06), 23, pattern="shared").calibration.patterns
     assert pattern.rms_m < 0.03
 
 
 @pytest.mark.slow
-def test_power_that_explains_what_looks_like_direction_is_named():
+def test_power_that_explains_a_pattern_is_named():
     ranges = calib.load_ranges(flown(replace(TEN, pattern_m=0.0), 3)[0])
     azimuth = np.arctan2(ranges.toward[:, :, 1], ranges.toward[:, :, 0])
     of_one = np.stack([ranges.initiator, ranges.target], axis=1) == 1
@@ -159,7 +159,7 @@ def test_fits_that_cannot_have_a_pattern_or_slope_refuse_it(settings: dict[str, 
         calib.fit_from_ranges(flown(SHORT, 5)[0], **dict[str, Any]({name: "shared"}))
 
 
-def test_a_range_is_corrected_by_two_directions_and_says_what_is_missing_without():
+def test_ranges_are_corrected_by_two_directions_or_warn():
     known, there = fitted(SHORT, 3).calibration, calib.load_ranges(flown(SHORT, 3, 1)[0])[:500]
     x, y, z = np.moveaxis(there.toward.astype(float), 2, 0)
     columns = (there.raw_m, there.fpp1_dbm, there.fpp2_dbm, there.initiator, there.target)
@@ -186,7 +186,7 @@ def test_a_range_is_corrected_by_two_directions_and_says_what_is_missing_without
         known.correct(3.0, -85.0, -86.0, 1, 2, azimuth_deg=(1.0, 2.0, 3.0))
 
 
-def test_the_file_keeps_patterns_and_older_programs_refuse_it():
+def test_files_keep_patterns_and_older_programs_refuse_them():
     known = fitted(SHORT, 3).calibration
     text = known.to_json()
     assert (calib.Calibration.from_json(text), json.loads(text)["schema_version"]) == (known, 6)
@@ -303,7 +303,7 @@ def test_directions_are_those_in_the_frames_of_the_bodies():
     assert np.isnan(toward[2]).all()
 
 
-def test_places_without_attitudes_tell_no_direction():
+def test_places_without_attitudes_give_no_direction():
     """Bodies without attitudes, as in tables of positions: sigma includes the effect of unknown directions."""
     known, (found, _) = fitted(SHORT, 3).calibration, flown(SHORT, 3, 1)
     when = np.unique(found.poses.time_ns)

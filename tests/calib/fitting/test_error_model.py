@@ -64,7 +64,7 @@ def test_pairs_have_the_share_of_reflections_that_was_planted():
 
 
 @pytest.mark.parametrize("loss", ["cauchy", "l2"])
-def test_any_loss_says_what_errors_are_made_of(loss):
+def test_all_losses_give_an_error_model(loss):
     fitted, held = halves(make(CLEAN["share by pair"], 11_004).ranges)
     found = calib.evaluate(held, calib.fit(fitted, loss=loss, between_m=0.0).calibration).overall
     assert 0.94 < found.total_std < 1.08
@@ -114,7 +114,7 @@ FEW = "twelve tags, six ranges a pair"
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [104, 105])
-def test_few_ranges_settle(seed):
+def test_fits_of_few_ranges_converge(seed):
     # These two searches continued for hundreds of steps in directions that no range determines.
     assert calib.fit(make(CLEAN[FEW], seed).ranges).success
 
@@ -166,7 +166,7 @@ def both():
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_a_range_of_powers_that_was_left_out_is_bridged(both, number):
+def test_the_curve_bridges_missing_powers(both, number):
     lifted, bias = both
     found = judged(lifted, bias, parts(lifted)[number])
     assert found.rms_m < found.cubic_rms_m + 0.005

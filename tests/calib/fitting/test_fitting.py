@@ -16,7 +16,7 @@ from tests.calib.synthetic import DELAYS_NS, about_their_mean, bias_m, design, r
 from uwblink.ticks import SPEED_OF_LIGHT
 
 
-def test_planted_delays_and_curve_come_back():
+def test_planted_delays_and_curve_are_found():
     r = ranges(20_000)
     before = r.raw_m.copy()
     result = calib.fit(r)
@@ -43,13 +43,13 @@ def test_curve_is_zero_at_the_reference_power_and_delays_are_those_for_it(refere
 
 
 @pytest.mark.parametrize(("reference_dbm", "nearest"), [(-60.0, -80.8), (-110.0, -94.2)])
-def test_a_reference_power_that_was_not_recorded_is_said(reference_dbm, nearest):
+def test_an_unrecorded_reference_power_has_a_warning(reference_dbm, nearest):
     found = calib.fit(ranges(600), reference_power_dbm=reference_dbm)
     (said,) = [warning for warning in found.warnings if "reference power" in warning]
     assert [f"{power} dBm" in said for power in (reference_dbm, nearest)] == [True, True]
 
 
-def test_ranges_left_out_as_static_were_left_out_on_purpose():
+def test_ranges_left_out_as_static_have_no_warning():
     some = ranges(600)
     asked, missing = (calib.fit(replace(some, excluded={why: 400})) for why in ("static", "no power"))
     assert not [warning for warning in asked.warnings if "left out" in warning]
@@ -57,7 +57,7 @@ def test_ranges_left_out_as_static_were_left_out_on_purpose():
 
 
 @pytest.mark.parametrize(("by_m", "way"), [(0.3, "longer"), (-0.3, "shorter")])
-def test_the_way_in_which_a_pair_reads_too_long_is_said(by_m, way):
+def test_the_sign_of_a_pairs_error_is_stated(by_m, way):
     some = ranges(3000, tail=0)
     first = np.where(np.arange(len(some)) % 12 < 6, some.initiator, some.target)
     second = some.initiator + some.target - first
@@ -67,13 +67,13 @@ def test_the_way_in_which_a_pair_reads_too_long_is_said(by_m, way):
     assert f"{way} if tag 2 initiates" in said
 
 
-def test_what_cannot_be_answered_says_why():
+def test_errors_of_undetermined_fits_state_the_reason():
     with pytest.raises(calib.UnanswerableError, match="too few"):
         calib.fit(ranges(60))
 
 
 @pytest.mark.slow
-def test_the_mixture_knows_delays_better_than_a_loss_does():
+def test_the_mixture_estimates_delays_better_than_a_loss():
     errors: dict[str, list[float]] = {"cauchy": [], "mixture": []}
     for seed in range(4):
         r = ranges(6000, tail=0.3, seed=seed)
@@ -86,7 +86,7 @@ def test_the_mixture_knows_delays_better_than_a_loss_does():
 
 
 @pytest.mark.slow
-def test_the_mixture_s_standard_errors_hold():
+def test_standard_errors_of_the_mixture_match_the_spread():
     scores = []
     for seed in range(16):
         found = calib.fit(ranges(1500, seed=seed), loss="mixture").calibration
@@ -125,7 +125,7 @@ def test_a_fit_is_the_same_to_the_last_digit_whatever_the_number_of_threads():
     assert found[0] == found[1]
 
 
-def test_ranges_far_too_short_are_no_inliers_and_are_counted():
+def test_ranges_far_too_short_are_counted_as_outliers():
     some = ranges(n=1200, noise_m=0.05, tail=0)
     short = np.arange(len(some)) % 40 == 0
     found = calib.fit(replace(some, raw_m=some.raw_m - 1.5 * short))
@@ -144,7 +144,7 @@ def test_a_scale_that_is_given_is_the_scale_of_the_loss():
         assert wide.calibration.delays_ns[tag] == pytest.approx(squares.calibration.delays_ns[tag], abs=1e-4)
 
 
-def test_what_is_not_known_of_the_smoothness_is_in_the_band_of_the_curve(monkeypatch):
+def test_the_band_of_the_curve_includes_the_uncertain_smoothness(monkeypatch):
     some = ranges(n=3000)
     whole, likely = (calib.fit(some, loss=loss).calibration.uncertainty.bias_m2 for loss in ("cauchy", "mixture"))
     assert 0.5 < np.trace(whole) / np.trace(likely) < 4
@@ -179,7 +179,7 @@ def test_what_is_not_known_of_the_smoothness_is_in_the_band_of_the_curve(monkeyp
         ("sequential", True),  # of the mixture, whose parameters follow
     ],
 )
-def test_a_mistake_names_its_parameter(parameter, value):
+def test_wrong_settings_are_named(parameter, value):
     with pytest.raises(calib.BadInputError) as caught:
         calib.fit(ranges(300), **{"loss": "mixture", parameter: value})
     assert caught.value.parameter == parameter
@@ -207,7 +207,7 @@ def known():
     return calib.fit(r[(r.initiator != 7) & (r.target != 7)]).calibration
 
 
-def test_its_delay_is_found_and_nothing_else_moves(known):
+def test_the_delay_of_a_new_tag_is_found_and_others_stay(known):
     added = calib.add_tag(ranges(3000, seed=5), known, 7).calibration
     assert {t: d for t, d in added.delays_ns.items() if t != 7} == known.delays_ns
     assert added.bias_curve == known.bias_curve
@@ -224,7 +224,7 @@ def test_a_new_tag_is_checked(known, tag, loss, parameter):
     assert caught.value.parameter == parameter
 
 
-def test_what_cannot_be_added(known):
+def test_new_tags_that_cannot_be_added_are_refused(known):
     r = ranges(3000)
     with pytest.raises(calib.BadInputError, match="has no ranges"):
         calib.add_tag(r, known, 42)
@@ -257,7 +257,7 @@ def own_loss():
     LOSSES.remove("welsch")
 
 
-def test_a_loss_of_ones_own_is_fitted_with(own_loss):
+def test_registered_losses_are_fitted(own_loss):
     r = ranges(3000)
     result = calib.fit(r, loss=own_loss)
     assert result.calibration.loss == "welsch"
@@ -282,7 +282,7 @@ def test_a_loss_of_ones_own_is_fitted_with(own_loss):
         ("nan", lambda u: (u / 0.0 * 0, u), "finite"),
     ],
 )
-def test_a_loss_that_cannot_be_one_is_refused(name, loss, fragment):
+def test_contradicting_losses_are_refused(name, loss, fragment):
     with np.errstate(all="ignore"), pytest.raises(calib.BadInputError, match=fragment):
         register_loss(name, loss)
     assert name not in set(LOSSES) - {"cauchy"}
@@ -306,7 +306,7 @@ def result():
     return replace(calib.fit(ranges(2000)), findings=[Finding("dog", "<b>beware</b> of the dog", "", None)])
 
 
-def test_it_prints_on_a_screen(result):
+def test_results_print_on_a_screen(result):
     text = repr(result)
     lines = text.splitlines()
     assert len(lines) < 20
@@ -337,7 +337,7 @@ def test_html_is_escaped(result):
     assert page.count("<tr>") == page.count("</tr>") == 1 + len(DELAYS_NS) + 3
 
 
-def test_it_draws_into_axes(result):
+def test_results_draw_into_axes(result):
     from matplotlib import pyplot
 
     for draw in (result.plot_bias, result.plot_sigma, result.plot_residuals, result.plot_delays):

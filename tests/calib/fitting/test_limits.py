@@ -64,7 +64,7 @@ def test_delays_alone_say_how_much_power_would_have_changed(settings):
     near_planted(result.calibration, but=-middle / NS_M)
 
 
-def test_the_curve_alone_carries_the_constant():
+def test_a_fit_of_the_curve_alone_includes_the_constant():
     given = {tag: delay + 0.1 for tag, delay in DELAYS_NS.items()}
     result = calib.fit(ranges(Plan(count=6000, bias=bias_m)), fixed_ns=given)
     found = result.calibration
@@ -114,7 +114,7 @@ def test_pairs_have_constants_of_their_own_where_delays_cannot_explain_them():
         calib.export(found, "c-header")
 
 
-def test_one_power_makes_a_flat_curve_and_says_so():
+def test_one_power_gives_a_flat_curve_and_a_warning():
     result = calib.fit(ranges(Plan(bias=bias_m, power_dbm=lambda _: -91.0)))
     near_planted(result.calibration, but=-bias_m(-91.0) / NS_M)
     assert result.calibration.bias_curve.flat

@@ -23,7 +23,7 @@ def recorded(tmp_path, scenario, *settings):
 NOTHING = calibration(dict.fromkeys(range(1, 7), 0.0), 0.1)
 
 
-def test_without_noise_they_are_what_was_planted(tmp_path):
+def test_without_noise_listeners_give_the_planted_delays(tmp_path):
     path = recorded(tmp_path, "noiseless.toml", "run.duration_s=20", *PASSIVE)
     planted = load_ranges(path).planted["delays_ns"]
     heard = heard_delays(path, NOTHING)
@@ -35,7 +35,7 @@ def test_without_noise_they_are_what_was_planted(tmp_path):
 
 
 @pytest.mark.slow
-def test_they_agree_with_the_fit_of_a_noisy_flight(tmp_path):
+def test_listeners_agree_with_the_fit_of_a_noisy_flight(tmp_path):
     path = recorded(tmp_path, "icra2023/train.toml", "run.duration_s=60", *PASSIVE)
     found = fit(load_ranges(path)).calibration
     heard = heard_delays(path, found)
@@ -46,5 +46,5 @@ def test_they_agree_with_the_fit_of_a_noisy_flight(tmp_path):
         assert one.delay_ns == pytest.approx(found.delays_ns[tag], abs=0.06)
 
 
-def test_no_listeners_no_delays(tmp_path):
+def test_without_listeners_there_are_no_delays(tmp_path):
     assert heard_delays(recorded(tmp_path, "icra2023/train.toml", "run.duration_s=5"), NOTHING) == {}

@@ -60,7 +60,7 @@ def test_sound_flights_keep_their_intervals(bodies):
     assert result.calibration.delays_std_ns == pytest.approx(alone.calibration.delays_std_ns, rel=1e-9)
 
 
-def test_ranges_know_the_bodies_of_their_tags_as_long_as_recordings_agree():
+def test_ranges_state_the_bodies_of_tags_if_recordings_agree():
     ranges, _ = ranges_with_field(3, bodies=3, seconds=2.0)
     assert dict(concatenate([ranges, ranges]).bodies) == dict(ranges.bodies)
     assert concatenate([ranges, replace(ranges, bodies=((1, "robot2"), *ranges.bodies[1:]))]).bodies == ()

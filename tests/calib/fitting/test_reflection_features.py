@@ -62,7 +62,7 @@ def test_planted_slopes_are_found(seed):
     assert found["response_db"].log_odds == pytest.approx(EXCESS, abs=0.06)
 
 
-def test_of_what_tells_nothing_the_slopes_are_small():
+def test_features_without_information_have_small_slopes():
     found = fitted(73, rise=0.0, excess=0.0).errors
     assert abs(found.features["rise_taps"].log_odds) < 0.15
     assert abs(found.features["response_db"].log_odds) < 0.06
@@ -86,7 +86,7 @@ def test_a_range_without_features_has_the_mean_share():
     assert fitted(71).apply(without_features(ranges)).tail_share.mean() == pytest.approx(reflected.mean(), abs=0.03)
 
 
-def test_beyond_the_fitted_values_odds_stay_constant():
+def test_odds_are_constant_beyond_the_fitted_values():
     known = fitted(71)
     top = known.errors.features["rise_taps"].bounds[1]
     shares = [
@@ -135,7 +135,7 @@ def response(rise, first=740.3, noise=10, late=0, length=1016):
     return [int(tap) for tap in taps]
 
 
-def test_a_first_path_that_rises_slowly_and_late_energy_are_told():
+def test_slow_rise_of_the_first_path_and_late_energy_are_features():
     steep, slow, echo = (response_features(one, 740.3) for one in (response(1), response(6), response(1, late=6000)))
     assert slow[1] - steep[1] == 5
     assert echo[0] > steep[0] + 5
@@ -146,7 +146,7 @@ def test_a_first_path_that_rises_slowly_and_late_energy_are_told():
     ("taps", "first"),
     [(None, 740.0), ([], 740.0), ([5] * 1016, 950.0), ([5] * 1016, 40.0), ([0] * 1016, 740.0), ([5] * 9, np.nan)],
 )
-def test_of_responses_that_do_not_reach_nothing_is_told(taps, first):
+def test_short_responses_have_no_features(taps, first):
     assert np.isnan(response_features(taps, first)).all()
 
 

@@ -39,7 +39,7 @@ def numbers(found):
     return [*calibration.delays_ns.values(), *calibration.delays_std_ns.values(), *calibration.bias_curve.coefficients]
 
 
-def test_neither_hours_between_sessions_nor_times_that_begin_at_zero_change_anything():
+def test_gaps_and_origins_of_time_between_sessions_have_no_effect():
     adjacent, (monday, tuesday) = calib.fit(sessions(1e-5)[1]), sessions(72)[1]
     at_zero = [replace(part, time_ns=part.time_ns - part.time_ns[0]) for part in (monday, tuesday)]
     assert between(adjacent) == []
@@ -78,7 +78,7 @@ def test_a_tag_whose_delay_changed_between_sessions_is_named_and_intervals_hold(
     assert abs(error - by_ns) < reach < 3 * by_ns
 
 
-def test_a_pair_that_reads_otherwise_in_one_session_is_named():
+def test_a_pair_with_another_offset_in_one_session_is_named():
     _, (monday, tuesday) = sessions(72)
     longer = np.isin(tuesday.initiator, (1, 2)) & np.isin(tuesday.target, (1, 2))
     found = calib.fit([monday, replace(tuesday, raw_m=tuesday.raw_m + 0.08 * longer)])
@@ -173,14 +173,14 @@ def test_the_rate_of_a_drift_is_found_within_its_interval(rate_m2, wander_m):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("wander_m", "most_m2"), [(0.0, 3e-6), (0.04, 1e-4)])
-def test_nothing_is_claimed_where_nothing_drifts(wander_m, most_m2):
+def test_without_drifts_no_rate_is_stated(wander_m, most_m2):
     drifts, by_age, *_, high = told(range(20, 28), wander_m=wander_m)
     # Sessions still give an upper bound.
     assert (drifts.any(), by_age.any(), high.max() < most_m2) == (False, False, True)
 
 
 @pytest.mark.parametrize(("worlds", "most"), [(2, 0), pytest.param(8, 1, marks=pytest.mark.slow)])
-def test_what_scatters_between_sessions_is_not_called_age(worlds, most):
+def test_scatter_between_sessions_is_not_called_a_drift(worlds, most):
     drifts, by_age, *_ = told(range(40, 40 + worlds), scatter_m=0.01)
     assert (drifts.all(), by_age.sum() <= most) == (True, True)
 
@@ -197,7 +197,7 @@ def test_what_scatters_between_sessions_is_not_called_age(worlds, most):
         (1e-4, (0, 7), r"2 sessions over 7 days: delays differ, but not significantly by age; .*for (\d+) days"),
     ],
 )
-def test_show_says_how_old_a_calibration_may_get(tmp_path, rate_m2, days, says):
+def test_show_states_the_useful_age_of_a_calibration(tmp_path, rate_m2, days, says):
     result = calib.fit(drifting(10_003, days, rate_m2))
     result.save(tmp_path / "known.json")
     low, likeliest, high = result.calibration.provenance["drift"]["m2_per_day"]

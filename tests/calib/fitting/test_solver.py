@@ -14,7 +14,7 @@ from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
 
 
 @pytest.mark.slow
-def test_the_joint_fit_is_better_where_power_goes_with_the_pair():
+def test_the_joint_fit_is_better_if_power_depends_on_the_pair():
     # A fit of delays alone takes the effect of a pair's typical power for a delay.
     slope = 0.2
     r = ranges(12_000, bias=lambda lifted: slope * lifted)
@@ -78,7 +78,7 @@ def test_a_reference_power_moves_a_constant_and_corrects_ranges_alike(settings):
     np.testing.assert_allclose(stated.apply(r).corrected_m, plain.apply(r).corrected_m, atol=1e-6)
 
 
-def test_the_band_holds_the_curve():
+def test_the_band_contains_the_curve():
     inside = []
     for seed in range(3):
         c = fit(ranges(4000, seed=seed)).calibration
@@ -108,7 +108,7 @@ def test_static_spans_are_left_out():
         without_static(replace(r, truth_m=np.full(len(r), 2.0)))
 
 
-def test_power_that_goes_with_distance_is_warned_of():
+def test_power_that_varies_with_distance_causes_a_warning():
     r = ranges(5000)
     assert not any("confounded" in warning for warning in fit(r).warnings)
     rng = np.random.default_rng(1)
@@ -126,7 +126,7 @@ def test_single_sided_ranges_and_missing_ones_are_warned_of():
     assert any("25 % of the exchanges were left out: no true distance" in warning for warning in found.warnings)
 
 
-def test_a_likelihood_that_leaves_a_pair_out_is_not_believed(monkeypatch):
+def test_a_search_that_excludes_a_pair_is_rejected(monkeypatch):
     found_by, r = known_distances.fit_likelihood, ranges(2000)
     assert fit(r).calibration.loss == "mixture"
 

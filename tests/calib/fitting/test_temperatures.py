@@ -63,7 +63,7 @@ def test_planted_slopes_are_found_within_their_intervals(mm_per_k, apart, patter
     ids=["plain", "little warmth, errors that last"],
 )
 @pytest.mark.parametrize("seed", [306, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (315, 316))])
-def test_sound_flights_have_no_slope_and_say_how_little_they_show(recipe, seed):
+def test_sound_flights_have_no_slope_and_state_its_uncertainty(recipe, seed):
     found = fitted(recipe, seed)
     assert (found.temperatures, json.loads(found.to_json())["schema_version"] < 7) == ((), True)
     assert "mm/K is not significant" in repr(found)
@@ -112,7 +112,7 @@ def test_a_range_is_corrected_by_two_temperatures_and_says_what_is_missing_witho
     assert one - other == pytest.approx(slope.m_per_k, abs=1e-6)
 
 
-def test_the_file_keeps_slopes_and_older_programs_refuse_it():
+def test_files_keep_slopes_and_older_programs_refuse_them():
     known = fitted(WARM, 3)
     text = known.to_json()
     assert (calib.Calibration.from_json(text), json.loads(text)["schema_version"]) == (known, 7)
@@ -164,7 +164,7 @@ def test_an_added_tag_shares_the_slope_of_the_others():
         ({"drift": {"sessions": 2, "days": "x", "m2_per_day": [0, 1, 2], "told": 1, "by_age": 1}}, "provenance: drift"),
     ],
 )
-def test_what_a_stranger_wrote_into_the_provenance_is_refused_in_a_line(tmp_path, broken, why):
+def test_faulty_provenance_is_refused_in_a_line(tmp_path, broken, why):
     table = json.loads(fitted(WARM, 3).to_json())
     (tmp_path / "c.json").write_text(json.dumps(table | {"provenance": table["provenance"] | broken}))
     refuse("calib", "show", tmp_path / "c.json", naming=[why])
@@ -191,7 +191,7 @@ int main(void)
 """
 
 
-def test_the_c_header_tells_what_temperatures_add(tmp_path):
+def test_the_c_header_states_the_effect_of_temperatures(tmp_path):
     found = printed(tmp_path, fitted(WARM, 3), MAIN).split()
     known, blind = fitted(WARM, 3), replace(fitted(WARM, 3), temperatures=())
     at = (3.0, -85.0, -86.0, 1, 3)
@@ -280,7 +280,7 @@ def test_readings_that_are_of_no_range_are_named(tag, later_s):
 
 
 @pytest.mark.parametrize(("celsius", "doubted"), [(46.0, False), (72.0, True)])
-def test_degrees_fahrenheit_are_doubted(celsius, doubted):
+def test_degrees_fahrenheit_have_a_warning(celsius, doubted):
     flight = calib.sample_flight()
     count = len(flight.exchanges)
     readings = {"time_ns": flight.exchanges.time_ns, "tag": np.full(count, 1), "supply_v": np.full(count, np.nan)}

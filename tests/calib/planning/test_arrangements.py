@@ -29,7 +29,7 @@ def information(inputs, one):
     return delay_information(inputs, one)[0] * (0.02 / C_M_PER_NS) ** 2
 
 
-def test_boards_in_a_row_give_what_was_counted_by_hand():
+def test_the_information_of_boards_in_a_row_agrees_with_counting():
     """r12 + r23 - r13 is twice half of the middle board's delay: its variance is that of three pairs."""
     values, vectors = np.linalg.eigh(information(given(3), *in_orders((1, 2, 3))))
     assert np.count_nonzero(values > 1e-6 * values[-1]) == 1
@@ -48,7 +48,7 @@ def test_information_of_a_known_place_is_that_of_its_coordinates():
 @pytest.mark.parametrize(
     ("boards", "on", "count", "each", "common"), [(4, "line", 8, 0.71, 0.35), (6, "plane", 10, 0.58, 0.24)]
 )
-def test_a_plan_promises_what_counting_says(boards, on, count, each, common):
+def test_plans_agree_with_counting(boards, on, count, each, common):
     """Random arrangements: 0.76 and 0.38 on a line, 0.78 and 0.30 in a plane; chosen ones are slightly better."""
     found = calib.plan(boards, on=on, arrangements=count)
     # Intervals include Student's factor of the degrees of freedom, about 1.05.
@@ -57,7 +57,7 @@ def test_a_plan_promises_what_counting_says(boards, on, count, each, common):
     assert found.common_ns / unit == pytest.approx(common, rel=0.1)
 
 
-def test_one_arrangement_of_eight_in_space_says_nothing_useful():
+def test_one_arrangement_of_eight_in_space_determines_no_delay():
     found = calib.plan(8, on="space", arrangements=1)
     assert len(found.undetermined) >= 7
     assert found.next_best[0].what.startswith("an arrangement with 1 at (")
@@ -73,13 +73,13 @@ def test_one_arrangement_of_eight_in_space_says_nothing_useful():
         (6, {"on": "space", "arrangements": 2, "anchors": [1, 2, 3, 4]}, ()),
     ],
 )
-def test_delays_stay_open_until_something_tells_them(boards, settings, undetermined):
+def test_delays_are_undetermined_without_known_facts(boards, settings, undetermined):
     found = calib.plan(boards, **settings)
     assert found.undetermined == undetermined
     assert all(half < 0.4 for tag, half in found.half_ns.items() if tag not in undetermined)
 
 
-def test_a_taped_distance_brings_what_it_is_said_to_bring():
+def test_the_gain_of_a_measured_distance_is_as_predicted():
     tape = next(
         best for best in calib.plan(5, on="plane", arrangements=3).next_best if "a measured distance" in best.what
     )
@@ -95,7 +95,7 @@ def test_a_taped_distance_brings_what_it_is_said_to_bring():
     assert common[0] < 0.9 * common[1] < 0.7 * common[2]
 
 
-def test_what_was_promised_is_what_a_survey_says():
+def test_plans_agree_with_surveys():
     plan = calib.plan(4, on="line", arrangements=7)
     places = [np.array([a.place_m[t] for t in plan.tags]) for a in plan.arrangements]
     result = calib.survey(standing_boards(3, places=places).ranges, known="line", pair_error_m=0.02)
@@ -103,7 +103,7 @@ def test_what_was_promised_is_what_a_survey_says():
     assert found == pytest.approx(np.array([plan.half_ns[t] for t in plan.tags]), rel=0.1)
 
 
-def test_without_a_number_it_stops_when_more_are_not_worth_it():
+def test_the_default_number_of_arrangements_stops_at_small_gains():
     found = calib.plan(4)
     assert 5 <= len(found.arrangements) < 12
     assert found.undetermined == ()
@@ -148,14 +148,14 @@ def test_what_cannot_be_planned_is_refused(boards, settings, message):
         calib.plan(boards, **settings)
 
 
-def test_three_in_a_row_say_nothing_where_one_of_their_pairs_is_mostly_reflected():
+def test_three_boards_in_a_row_are_not_used_if_a_pair_is_mostly_reflected():
     """All three pairs are direct with 0.9^3 = 0.73 and 0.7^3 = 0.34; then the middle delay is determined as usual."""
     row = in_orders((1, 2, 3))
     assert predict(given(3, reflected=0.1), row)[0].each[1] == pytest.approx(0.02 * math.sqrt(3) / C_M_PER_NS)
     assert np.isinf(predict(given(3, reflected=0.3), row)[0].each[1])
 
 
-def test_reflected_pairs_cost_what_their_loss_costs():
+def test_reflected_pairs_cost_the_information_of_missing_pairs():
     """Compared with draws over the same arrangements, in which reflected pairs are left out."""
     rng = np.random.default_rng(5)
     places = [places_of(rng, 6, 2, 4.0, 0.4) for _ in range(6)]
@@ -183,7 +183,7 @@ def test_reflected_pairs_cost_what_their_loss_costs():
     assert np.mean(found) > 1.05 * np.mean(plain)
 
 
-def test_a_curve_costs_what_a_process_of_its_size_costs(monkeypatch):
+def test_a_curve_costs_the_information_of_a_process_of_its_size(monkeypatch):
     """The formula of the benchmark has the process itself; plan and survey have splines."""
     monkeypatch.setattr(surveys, "power_dbm", lambda length: POWER_AT_1_M_DBM - 20 * math.log10(length))
     world = standing_boards(3, "plane", boards=5, arrangements=5, size_m=6.0, each=5)
@@ -192,7 +192,7 @@ def test_a_curve_costs_what_a_process_of_its_size_costs(monkeypatch):
     assert found == pytest.approx(expected, rel=0.1)
 
 
-def test_a_plan_says_what_reflections_and_a_curve_cost():
+def test_a_plan_states_the_accuracy_lost_by_reflections_and_a_curve():
     plain, reflected = (calib.plan(4, on="line", arrangements=4, reflected=share) for share in (0.0, 0.1))
     assert "and 10 % of the pairs are reflected:" in str(reflected)
     assert max(reflected.half_ns.values()) > max(plain.half_ns.values())

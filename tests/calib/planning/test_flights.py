@@ -58,7 +58,7 @@ def test_with_everything_known_a_plan_is_a_fit_with_known_distances():
 
 
 @pytest.mark.slow
-def test_what_a_fit_says_is_what_was_promised():
+def test_plans_agree_with_fits_of_flights():
     """One flight: the intervals of the fit, which also estimates errors and smoothness, agree within a fifth."""
     seen = flight(seconds=12.0, seed=1, wander_deg=3.0, tilt_deg=1.0, place_noise_m=0.02)
     found = planned(seen, poses_until_s=6.0)
@@ -68,13 +68,13 @@ def test_what_a_fit_says_is_what_was_promised():
     assert stated == pytest.approx(np.sqrt(np.mean(found.verdict.std**2)), rel=0.2)
 
 
-def test_a_flight_like_it_promises_about_the_same():
+def test_plans_of_similar_flights_agree():
     like = rehearsed(robots=3, anchors=(), rate_hz=80.0, seconds=16.0, apart_m=0.68, speed_m_s=0.7)
     seen = mean_ns(flight(seconds=16.0), poses_until_s=6.0)
     assert mean_ns(like, poses_until_s=6.0) == pytest.approx(seen, rel=0.2)
 
 
-def test_what_nothing_determines_is_named_and_what_would_is_ranked():
+def test_undetermined_delays_are_named_and_measurements_ranked():
     short: Any = {"seconds": 11.0, "rate_hz": 40.0}
     plan = calib.plan_flight(3, poses_until_s=0.0, **short)
     assert (plan.undetermined, set(plan.half_ns.values())) == ((1, 2, 3, 4, 5, 6), {math.inf})
@@ -115,11 +115,11 @@ def base_ns():
         ({"seconds": 12.0}, {}, 0.3, 1.0),
     ],
 )
-def test_better_knowledge_never_widens(base_ns, flown, changes, least, most):
+def test_better_known_facts_never_widen_intervals(base_ns, flown, changes, least, most):
     assert least < mean_ns(rehearsed(**flown), **({"poses_until_s": 2.0} | changes)) / base_ns < most
 
 
-def test_an_accelerometer_bridges_few_ranges_and_a_good_one_more():
+def test_accelerometers_bridge_few_ranges():
     few: Any = {"rate_hz": 12.0, "seconds": 10.0}
     plan = calib.plan_flight(2, anchors=ANCHORS, imu="consumer", poses_until_s=4.0, **few)
     seen = rehearsed(**few, imu="consumer")
@@ -131,7 +131,7 @@ def test_an_accelerometer_bridges_few_ranges_and_a_good_one_more():
     assert good < poor < 1.05 * none
 
 
-def test_trajectories_are_held_as_jerky_as_they_are_planned(monkeypatch):
+def test_planned_roughness_of_trajectories_is_that_of_the_motion(monkeypatch):
     """Compared with third differences of the poses."""
     seen = rehearsed(robots=3, anchors=(), rate_hz=20.0, seconds=16.0)
     time = seen.poses.time_ns[seen.poses.body == "robot1"] * 1e-9
@@ -151,7 +151,7 @@ def test_trajectories_are_held_as_jerky_as_they_are_planned(monkeypatch):
     assert 1.1 * held < mean_ns(few, poses_until_s=5.0) < 2 * held
 
 
-def test_a_tape_between_robots_that_stand_says_what_all_delays_share():
+def test_a_distance_of_robots_at_rest_determines_the_common_delay():
     given: Any = {"seconds": 8.0, "rate_hz": 30.0, "poses_until_s": 0.0, "still_s": 4.0, "delays_only": True}
     free, taped = calib.plan_flight(2, **given), calib.plan_flight(2, taped=1, **given)
     assert free.common_ns > max(0.7, taped.common_ns / 0.3)
@@ -163,14 +163,14 @@ def test_a_tape_between_robots_that_stand_says_what_all_delays_share():
 
 
 @pytest.mark.slow
-def test_the_best_tape_is_the_best_of_all():
+def test_the_best_measured_distance_is_the_best_of_all():
     seen = planned(rehearsed(), poses_until_s=4.0, anchors="sought")
     pairs = [(a, b) for a in ANCHORS for b in ANCHORS if a < b]
     spread = [np.trace(Information(seen.flight.taped([pair], 0.0, 0.01)).covariance_ns2) for pair in pairs]
     assert seen.best_tape(0.0, 0.01) == pairs[int(np.argmin(spread))]
 
 
-def test_the_motion_that_is_rehearsed_is_one_motion():
+def test_ranges_readings_and_poses_of_a_plan_are_one_motion():
     """Ranges are those of poses and lever arms; readings are the second derivative of the poses."""
     seen = rehearsed(robots=((1, 2), (7,)), anchors=(9,), imu="consumer", seconds=8.0, still_s=2.0, seed=3)
     ranges = calib.load_ranges(seen)
@@ -190,7 +190,7 @@ def test_the_motion_that_is_rehearsed_is_one_motion():
     assert np.ptp(seen.poses.position_m[mine], axis=0).max() < 6.0
 
 
-def test_the_command_prints_steps_and_what_a_fit_is_told():
+def test_the_command_prints_steps_and_options_of_the_fit():
     words = ["plan", "flight", "1,2/5", "--duration", "5", "--anchor-tags", "11,12,13,14", "--rate", "30"]
     printed = processes.succeed("calib", *words, "--poses-until", "0", "--heading-std", "1").stdout
     assert "tags 1 and 2 on robot 1, 5 on robot 2." in printed
@@ -259,7 +259,7 @@ def test_a_flight_whose_poses_lack_is_refused_in_one_line():
         ("flight 3 --anchors lost", "--anchors"),
     ],
 )
-def test_what_cannot_be_planned_is_named_by_its_option(words, named):
+def test_wrong_plans_name_the_option(words, named):
     processes.refuse("calib", "plan", *words.split(), naming=[named])
 
 

@@ -93,7 +93,7 @@ def campaign(folder):
     return calib.run_campaign(calib.load_ranges(folder / "a.uwb"), loss="l2")
 
 
-def test_ranges_alone_are_fitted_and_judged(campaign, tmp_path):
+def test_ranges_are_fitted_and_evaluated(campaign, tmp_path):
     assert (campaign.findings, campaign.tracks) == ([], [])
     assert (len(campaign.training[0]), campaign.evaluation.overall.full.n) == (900, 270)
     (tmp_path / "mine.pdf").write_text("mine")
@@ -104,7 +104,7 @@ def test_ranges_alone_are_fitted_and_judged(campaign, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["mine.pdf"]
 
 
-def test_without_tests_errors_are_those_of_ranges_that_were_held_out(campaign, folder, tmp_path, sections):
+def test_without_tests_errors_are_those_of_held_out_ranges(campaign, folder, tmp_path, sections):
     """The fourth, seventh and last tenth of the time evaluate a fit to the others; delays are those of a fit to all."""
     whole = calib.load_ranges(folder / "a.uwb")
     tenth = np.floor(10 * (whole.time_ns - whole.time_ns[0]) / (whole.time_ns[-1] - whole.time_ns[0]))
@@ -119,7 +119,7 @@ def test_without_tests_errors_are_those_of_ranges_that_were_held_out(campaign, f
         assert words in page
 
 
-def test_ranges_too_few_to_hold_out_are_judged_themselves(folder):
+def test_too_few_ranges_are_evaluated_on_themselves(folder):
     """Pair 1-3 has ranges only in the last tenth, which would be held out."""
     whole = calib.load_ranges(folder / "a.uwb")
     late = whole.time_ns > whole.time_ns[0] + 0.9 * (whole.time_ns[-1] - whole.time_ns[0])
@@ -130,7 +130,7 @@ def test_ranges_too_few_to_hold_out_are_judged_themselves(folder):
         calib.run_campaign(few, loss="l2", hold_out=0.3)
 
 
-def test_what_pairs_leave_open_is_one_warning_whatever_the_recordings(tmp_path, sections):
+def test_undetermined_delays_are_one_warning(tmp_path, sections):
     """One tag ranges with all others."""
     flights = [calib.sample_flight(seed=seed) for seed in (1, 2)]
     stars = [replace(one, exchanges=one.exchanges[one.exchanges.initiator == 1]) for one in flights]
@@ -144,7 +144,7 @@ def weather(campaign):
     return [Heading("Weather"), Text(f"Dry over {len(campaign.judged)} ranges; <wet> tomorrow.")]
 
 
-def test_a_section_of_ones_own_is_in_the_report(campaign, tmp_path, sections):
+def test_registered_sections_are_in_the_report(campaign, tmp_path, sections):
     sections |= {"delays": SECTIONS["delays"]}
     calib.register_report_section("weather", weather, before="determined")
     campaign.write(tmp_path / "r.html", tmp_path / "r.pdf")
@@ -172,7 +172,7 @@ def test_a_section_of_ones_own_is_in_the_report(campaign, tmp_path, sections):
         ("weather", "text", "provenance", "section"),
     ],
 )
-def test_a_section_that_cannot_be_one_is_refused(name, section, before, parameter, sections):
+def test_wrong_sections_are_refused(name, section, before, parameter, sections):
     with pytest.raises(calib.BadInputError) as caught:
         calib.register_report_section(name, section, before=before)
     assert caught.value.parameter == parameter
@@ -196,7 +196,7 @@ def test_a_section_that_returns_no_blocks_is_named(campaign, tmp_path, blocks, s
         (["evaluate", "a.uwb", "-c", "b.json"], {"delays"}),
     ],
 )
-def test_commands_draw_what_they_find_and_replace_nothing(folder, words, names, sections, monkeypatch):
+def test_commands_draw_results_and_replace_no_files(folder, words, names, sections, monkeypatch):
     # Figures of a report are rendered in test_report.py.
     monkeypatch.setattr(figures, "drawn", pages.outline)
     shutil.rmtree(folder / "out", ignore_errors=True)
@@ -210,7 +210,7 @@ def test_commands_draw_what_they_find_and_replace_nothing(folder, words, names, 
         command(app, words, catch_exceptions=False)
 
 
-def test_one_file_does_not_take_the_place_of_another(folder, tmp_path):
+def test_reports_do_not_replace_files(folder, tmp_path):
     done = run(folder, "report", "a.uwb", "-o", "same.pdf", "--pdf", "same.pdf", "--loss", "huber", status=2)
     assert "same.pdf" in done.stderr
     assert not (folder / "same.pdf").exists()
@@ -230,7 +230,7 @@ def words_of(svg):
 
 
 @pytest.mark.slow
-def test_a_plan_has_a_picture_of_each_arrangement_with_tapes_and_intervals(tmp_path):
+def test_plans_have_a_figure_of_each_arrangement(tmp_path):
     words = ("plan", "survey", "7,12,3", "--on", "line", "--arrangements", "2", "--taped", "1")
     run(tmp_path, *words, "-o", "plan.html", "--figures", "f")
     page, files = (tmp_path / "plan.html").read_text(), {path.name for path in (tmp_path / "f").iterdir()}
@@ -252,7 +252,7 @@ def test_a_plan_has_a_picture_of_each_arrangement_with_tapes_and_intervals(tmp_p
     assert in_space.count("5") >= 3
 
 
-def test_a_planned_flight_has_its_path_its_intervals_and_what_brings_more(tmp_path):
+def test_planned_flights_have_figures_of_path_intervals_and_gains(tmp_path):
     words = ["plan", "flight", "2", "--duration", "8", "--rate", "40", "--anchor-tags", "11,12,13,14"]
     run(tmp_path, *words, "--anchors", "sought", "--poses-until", "4", "-o", "plan.html")
     text = (tmp_path / "plan.html").read_text(encoding="utf-8")
@@ -271,7 +271,7 @@ def table(rows, above=()):
 
 # Numbers of lines for which the table ends shortly below the page, begins shortly above its end, or fits.
 @pytest.mark.parametrize(("filled", "told"), [(18, []), (24, [Text("What the table shows.")]), (44, [])])
-def test_on_paper_a_table_is_not_parted_and_stands_below_its_heading(filled, told):
+def test_pdf_tables_are_on_one_page_with_their_heading(filled, told):
     lines = [Text(f"A line of text, the {k}th.") for k in range(filled)]
     text = paper(*lines, Heading("Before"), *told, table(16, [("", 1), ("raw", 1)]))
     ends = [k for k, one in enumerate(text) if re.search(r"row-(0|15)\b", one)]
@@ -281,7 +281,7 @@ def test_on_paper_a_table_is_not_parted_and_stands_below_its_heading(filled, tol
         assert "Before" in text[ends[0]]
 
 
-def test_on_paper_a_long_table_goes_on_from_where_it_stands_and_a_wide_one_is_cut():
+def test_long_and_wide_pdf_tables_are_divided():
     first, *others = paper(Text("A line of text."), Heading("Before"), table(120))
     assert re.search(r"row-0\b", first)
     assert len(others) == 2

@@ -116,7 +116,7 @@ def same(found, expected, where=""):
         assert found == pytest.approx(expected, rel=1e-6, abs=1e-6), where
 
 
-def test_an_evaluation_is_what_the_definitions_say(folder, page):
+def test_evaluations_agree_with_the_definitions(folder, page):
     found = json.loads((folder / "e.json").read_text())
     groups = page.groups()
     assert set(found["pairs"]) == set(groups) - {"all"}
@@ -152,7 +152,7 @@ def test_the_report_has_the_evaluation_s_numbers(page, tables):
         assert [number(cell) for cell in cells[1:]] == pytest.approx(covered[name], abs=0.51)
 
 
-def test_the_report_says_where_it_comes_from(folder, monkeypatch):
+def test_the_report_states_its_origin(folder, monkeypatch):
     page = (folder / "r.html").read_text()
     assert "calib evaluate f.uwb -c c.json --json --report r.html" in page
     assert page.count("SHA-256 ") == 2, "of the recording and of the calibration"
@@ -165,7 +165,7 @@ def found_of(tables, question):
     return tables.row(question, "criterion")[2]
 
 
-def test_the_verdict_has_the_numbers_that_it_rests_on(page, tables):
+def test_the_verdict_has_the_numbers_of_its_criteria(page, tables):
     raw, full = (100 * np.median(np.abs(error - page.truth)) for error in (page.raw, page.full))
     before, after, change = map(float, re.findall(r"[-+]?\d+\.?\d*", found_of(tables, "Do range errors decrease?"))[:3])
     assert [before, after, change] == pytest.approx([raw, full, 100 * (full / raw - 1)], abs=0.51)
@@ -214,7 +214,7 @@ def test_the_summary_and_the_delays_have_the_numbers(folder, page, tables):
         assert [float(cell) for cell in cells[1:4]] == pytest.approx([delay, delay - half, delay + half], abs=6e-5)
 
 
-def test_applied_ranges_are_what_the_definitions_say(folder, page):
+def test_corrected_ranges_agree_with_the_definitions(folder, page):
     with (folder / "applied" / "corrected.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     for name, expected in {
@@ -256,7 +256,7 @@ def test_exports_have_the_numbers(folder):
     assert miluv["tx_rx_split"] == {"tx": 0.44, "rx": 0.56}
 
 
-def test_the_errors_of_ros_yaml_are_what_the_model_says(folder, page):
+def test_the_errors_of_ros_yaml_agree_with_the_model(folder, page):
     errors = yaml.safe_load(run(folder, "calib", "export", "c.json", "--to", "ros-yaml"))["uwb_calibration"]["errors"]
     assert errors["lifted"] == KNOWN["errors"]["lifted"]
     inside = ~page.clamped
@@ -303,7 +303,7 @@ def changed(known: calib.Calibration, **parts) -> calib.Calibration:
     return replace(known, provenance=known.provenance | parts)
 
 
-def test_what_fits_what_it_has_not_seen_is_fit_for_use(known, unseen):
+def test_good_calibrations_are_fit_for_use(known, unseen):
     text, met = told(known, unseen)
     assert text.kind == "good"
     assert text.text.startswith("Fit for use. ")
@@ -311,7 +311,7 @@ def test_what_fits_what_it_has_not_seen_is_fit_for_use(known, unseen):
     assert set(met.values()) == {"✓ yes"}
 
 
-def test_without_a_test_and_with_warnings_there_are_reservations(known, unseen):
+def test_missing_tests_and_warnings_are_reservations(known, unseen):
     text, met = told(known, unseen, tests=[], training=[unseen])
     assert (text.kind, met["Was it evaluated on other recordings than the fitted ones?"]) == ("doubt", "! in part")
     clock = Finding(fault="clock", evidence="it jumps", remedy="leave it out", p_value=0.0)
@@ -355,7 +355,7 @@ def of_other_boards(known, unseen):
         (of_other_boards, "Do range errors decrease?", ""),
     ],
 )
-def test_what_changed_since_makes_it_unfit(known, unseen, change, question, words):
+def test_changed_boards_make_a_calibration_unfit(known, unseen, change, question, words):
     text, met = told(*change(known, unseen))
     assert (text.kind, met[question]) == ("bad", "✗ no")
     assert text.text.startswith("Not fit for use. ")
@@ -373,7 +373,7 @@ def test_a_few_ranges_of_a_pair_do_not_make_it_unfit(known, unseen):
         assert (met["Are all pairs free of bias?"], text.kind == "bad") == (mark, mark == "✗ no")
 
 
-def test_few_powers_that_were_not_fitted_are_a_reservation(known, unseen):
+def test_few_powers_outside_the_fitted_ones_are_a_reservation(known, unseen):
     assert (
         told(*stronger(known, unseen, 0.12))[1]["Are the powers of the recordings within the fitted powers?"]
         == "! in part"
@@ -394,7 +394,7 @@ def grades(known: calib.Calibration) -> dict[str, str]:
     return {one.question: one.grade for one in found if "antenna delays" not in one.question}
 
 
-def test_each_criterion_of_a_survey_fails_where_it_should(surveyed):
+def test_each_criterion_of_a_survey_fails_for_its_fault(surveyed):
     known = surveyed.calibration
     assert set(grades(known).values()) == {"good"}
     rests = known.provenance["rests_on"]
@@ -416,7 +416,7 @@ def foundations(known: calib.Calibration) -> list[Any]:
     return SECTIONS["foundations"](Results(calibration=known))
 
 
-def test_the_section_has_the_places_and_the_reflected_pair(surveyed):
+def test_reports_of_surveys_have_positions_and_reflected_pairs(surveyed):
     heading, text, places, picture, *rest = foundations(surveyed.calibration)
     table = rest[-1]
     assert [type(block) for block in (text, places, picture, table)] == [Text, Table, Picture, Table]
@@ -432,7 +432,7 @@ def test_the_section_has_the_places_and_the_reflected_pair(surveyed):
     assert float(table.rows[0][2]) == pytest.approx(40, abs=6)
 
 
-def test_a_flight_without_motion_capture_tells_what_it_rests_on(known):
+def test_reports_without_motion_capture_state_known_facts(known):
     assert (foundations(known), grades(known)) == ([], {})
     rests = {"moving": ["robot"], "known_s": 10.0, "anchors_given": ["a", "b"], "attitudes": "ahrs"}
     blind = changed(known, truth="ranges", rests_on=rests, distance_std_m=0.03)
@@ -443,7 +443,7 @@ def test_a_flight_without_motion_capture_tells_what_it_rests_on(known):
     assert list(grades(blind).values()) == ["doubt"]
 
 
-def test_reports_of_a_survey_and_of_its_evaluation_say_what_it_rests_on(surveyed, tmp_path, monkeypatch):
+def test_reports_of_surveys_and_their_evaluation_state_known_facts(surveyed, tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "drawn", pages.outline)  # as above
     page = tmp_path / "page.html"
     write_survey_report(page, surveyed.calibration)

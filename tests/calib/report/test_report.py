@@ -59,7 +59,7 @@ def test_the_campaign_has_every_section_in_order(campaign):
         assert page.count(hashlib.sha256((campaign / name).read_bytes()).hexdigest()) == 1
 
 
-def test_every_figure_has_the_size_of_paper(campaign):
+def test_all_figures_have_paper_size(campaign):
     page = (campaign / "r.html").read_text()
     drawings = re.findall("<svg.*?</svg>", page, re.DOTALL)
     assert len(drawings) == 2 * page.count("<figure>")
@@ -114,7 +114,7 @@ def test_the_pdf_has_numbered_pages_an_outline_and_figures_that_are_drawings(cam
     assert all(name in texts[place] for name, place in begin.items())
 
 
-def test_the_json_tells_what_the_page_tells(campaign):
+def test_the_json_contains_the_results_of_the_page(campaign):
     document = json.loads((campaign / "r.json").read_text())
     assert {"calibration", "warnings", "evaluation", "heard", "findings", "localization"} == set(document)
     assert document["evaluation"]["overall"]["full"]["n"] == 960
@@ -123,7 +123,7 @@ def test_the_json_tells_what_the_page_tells(campaign):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 390])
-def test_a_browser_shows_it(campaign, tmp_path, width):
+def test_a_browser_shows_the_report(campaign, tmp_path, width):
     picture = tmp_path / "page.png"
     words = (f"--window-size={width},2400", f"--screenshot={picture}", (campaign / "r.html").as_uri())
     chromium(*words, profile=tmp_path / "profile")
@@ -141,7 +141,7 @@ def test_tests_take_several_files():
     assert spread_tests(["fit", "a", "-o", "c"]) == ["fit", "a", "-o", "c"]
 
 
-def test_planted_delays_stand_beside_fitted_ones(campaign):
+def test_planted_delays_are_shown_beside_fitted_ones(campaign):
     header, *rows = page_of_numpy.Tables((campaign / "r.html").read_text()).having("planted, same gauge (ns)")
     with Recording.open(campaign / "train.uwb") as recording:
         planted = recording.meta()["planted"]["delays_ns"]

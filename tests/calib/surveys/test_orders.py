@@ -30,7 +30,7 @@ def right():
     return calib.survey(FIVE.ranges, known=said_with(FIVE))
 
 
-def test_right_orders_from_either_end_are_not_spoken_against(right):
+def test_correct_orders_from_either_end_have_no_finding(right):
     known = said_with(FIVE)
     turned = replace(known, orders={name: order[::-1] for name, order in known.orders.items()})
     assert right.contradictions == ()
@@ -38,7 +38,7 @@ def test_right_orders_from_either_end_are_not_spoken_against(right):
     assert found.calibration.delays_ns == pytest.approx(right.calibration.delays_ns, abs=1e-3)
 
 
-def test_exchanged_labels_are_named_and_the_ranges_are_believed(right):
+def test_exchanged_labels_are_named_and_ranges_determine_the_order(right):
     order = orders_of(FIVE, None)[0]["3"]
     pair = f"{min(order[:2])} and {max(order[:2])}"
     # Labels that are exchanged in all arrangements are one mistake.

@@ -96,7 +96,7 @@ def test_planted_reflections_are_named_and_delays_are_as_good_as_without():
     assert len(result.calibration.provenance["reflected"]) == len(result.reflected)
 
 
-def test_no_pair_is_believed_to_be_reflected_to_a_shorter_way():
+def test_reflections_do_not_shorten_ranges():
     """Two ranges 40 cm too short explain these as well as reflections do, with one delay 1.4 ns off."""
     world = standing_boards(1034, boards=5, arrangements=8, reflected=0.1)
     found = calib.survey(world.ranges, known="line")
@@ -105,7 +105,7 @@ def test_no_pair_is_believed_to_be_reflected_to_a_shorter_way():
         assert abs(found.calibration.delays_ns[tag] - delay) < 3 * found.calibration.delays_std_ns[tag]
 
 
-def test_what_cannot_be_told_is_said_and_widens():
+def test_ambiguous_reflections_are_stated_and_widen_intervals():
     world = standing_boards(5, boards=3, arrangements=6, pair_error_m=0.01)
     longer = reflected(world, 1, 1, 2, 0.4)
     result = calib.survey(replace(world.ranges, raw_m=world.ranges.raw_m + longer), known="line")

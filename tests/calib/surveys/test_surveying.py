@@ -92,7 +92,7 @@ def test_intervals_of_delays_and_places_hold_in_the_stated_frame():
     assert np.mean(inside) > 0.8  # of 15, and those of one arrangement are dependent
 
 
-def test_three_boards_in_a_row_give_the_delay_of_the_middle_one_alone_until_distances_are_taped():
+def test_three_boards_in_a_row_determine_only_the_middle_delay():
     world = standing_boards(5, boards=3, places=in_order((1, 2, 3)), pair_error_m=0.005)
     result = calib.survey(world.ranges, known="line")
     assert list(result.calibration.delays_ns) == [2]
@@ -105,7 +105,7 @@ def test_three_boards_in_a_row_give_the_delay_of_the_middle_one_alone_until_dist
     assert max(map(abs, scores(result, world.delays_ns).values())) < 3
 
 
-def test_one_arrangement_in_space_determines_nothing_and_says_of_whom():
+def test_one_arrangement_in_space_determines_nothing_and_names_the_boards():
     world = standing_boards(5, "space", boards=5, arrangements=1)
     with pytest.raises(
         calib.UnanswerableError, match=r"determine no delay: .* can change .*`calib plan survey`"
@@ -126,7 +126,7 @@ def test_a_curve_over_power_is_found_along_with_the_delays():
 
 
 @pytest.mark.slow
-def test_what_delays_share_is_inside_its_interval_where_the_curve_is_not_monotone():
+def test_the_common_delay_is_within_its_interval_for_non_monotonic_curves():
     world = standing_boards(1002, boards=5, arrangements=8, wave_size_m=0.05, board_power_db=1.0)
     length = float(np.linalg.norm(world.places[0][0] - world.places[0][1]))
     taped = calib.Knowledge(shape="line", distances=(KnownDistance(1, 2, length, 0.005, "1"),))
@@ -138,7 +138,7 @@ def test_what_delays_share_is_inside_its_interval_where_the_curve_is_not_monoton
     assert float(fall[0] - fall[1]) == pytest.approx(0.076, abs=0.045)
 
 
-def test_the_shape_at_the_head_holds_for_arrangements_that_say_nothing_of_it(tmp_path):
+def test_the_general_shape_applies_to_arrangements_without_one(tmp_path):
     world = standing_boards(3, places=FOUR[:3])
     marks = "".join(f"[[arrangements]]\nname = 'm{k}'\nstart_s = {70 * k}\nend_s = {70 * k + 60}\n" for k in range(3))
     path = tmp_path / "known.toml"
@@ -152,7 +152,7 @@ def test_the_shape_at_the_head_holds_for_arrangements_that_say_nothing_of_it(tmp
 
 
 @pytest.mark.parametrize("shape", ["", "line"])
-def test_one_pair_determines_nothing_in_whatever_arrangements(shape):
+def test_one_pair_determines_no_delay(shape):
     ranges = standing_boards(1, boards=2, arrangements=4).ranges
     for count in (1, 4):
         spans = {str(k): (70.0 * k, 70.0 * k + 60) for k in range(count)}
@@ -160,7 +160,7 @@ def test_one_pair_determines_nothing_in_whatever_arrangements(shape):
             calib.survey(ranges, known=calib.Knowledge(shape=shape, spans_s=spans))
 
 
-def test_a_file_of_what_is_known_is_read_number_by_number(tmp_path):
+def test_files_of_known_facts_are_read(tmp_path):
     path = tmp_path / "known.toml"
     path.write_text(
         "[[distances]]\nbetween = [4, 1]\ndistance_m = 3.06\n"
@@ -178,7 +178,7 @@ def test_a_file_of_what_is_known_is_read_number_by_number(tmp_path):
     assert (known.spans_s, known.order_of(Arrangement("B", 0, 1))) == ({"B": (70.0, 130.5)}, (3, 1, 4, 2))
 
 
-def test_a_distance_said_of_all_arrangements_is_one_reading():
+def test_a_distance_for_all_arrangements_is_one_measurement():
     world = standing_boards(5, boards=3, places=in_order(*[(1, 2, 3)] * 4), pair_error_m=0.002)
     taped = tuple(KnownDistance(i, i + 1, d, 0.02) for i, d in ((1, 0.9), (2, 1.2)))
     spans = {str(k): (70.0 * k, 70.0 * k + 60) for k in range(4)}
@@ -187,7 +187,7 @@ def test_a_distance_said_of_all_arrangements_is_one_reading():
     assert found.delays_std_ns[1] == pytest.approx(2 * 0.02 / 0.2997, rel=0.25)
 
 
-def test_a_position_said_of_all_arrangements_is_one_reading():
+def test_a_position_for_all_arrangements_is_one_measurement():
     world = standing_boards(5, "plane", boards=3, places=[standing_boards(5, "plane", boards=3).places[0]] * 4)
     at = {t: tuple(place.tolist()) for t, place in enumerate(world.places[0], start=1)}
     stds = []
@@ -221,7 +221,7 @@ def test_few_arrangements_widen_intervals_by_students_quantile():
     assert found == pytest.approx(result.verdict.std[result.verdict.determined] * wider, rel=1e-6)
 
 
-def test_known_positions_give_the_frame_and_the_mirror_is_told():
+def test_known_positions_give_the_frame_and_mirror_images_are_stated():
     corners = np.array(
         [[0.0, 0.0, 1.0], [6.0, 0.0, 1.2], [6.0, 5.0, 0.9], [0.0, 5.0, 1.1], [2.5, 2.0, 2.4], [3.0, 4, 0.2]]
     )
@@ -281,7 +281,7 @@ def crooked_line():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mistake", [wrong_labels, wrong_tape, crooked_line])
-def test_what_is_said_wrongly_is_named(mistake):
+def test_wrong_known_facts_are_named(mistake):
     world, known, kind, message = mistake()
     result = calib.survey(world.ranges, known=known, regardless=True)
     assert [one.fault for one in result.contradictions] == [kind]
@@ -292,7 +292,7 @@ def test_what_is_said_wrongly_is_named(mistake):
         assert [one.known for one in result.arrangements] == ["line", "line", "plane", "line", "line"]
 
 
-def test_nothing_is_said_against_what_is_right():
+def test_correct_known_facts_have_no_finding():
     said = calib.Knowledge(shape="line", distances=(KnownDistance(1, 3, 2.1, 0.01, "1"),))
     assert calib.survey(standing_boards(1, places=FOUR[:4]).ranges, known=said).findings == ()
 
@@ -328,7 +328,7 @@ def test_a_known_delay_stays_and_the_others_follow():
         ("known = ", "not valid TOML"),
     ],
 )
-def test_mistakes_in_the_file_of_what_is_known_are_one_line(tmp_path, text, message):
+def test_errors_in_files_of_known_facts_are_one_line(tmp_path, text, message):
     path = tmp_path / "known.toml"
     path.write_text(text)
     with pytest.raises(calib.BadInputError, match=message) as caught:
@@ -376,7 +376,7 @@ def surveyed(recording):
     return calib.survey(recording)
 
 
-def test_the_command_takes_a_recording_an_arrangement_and_writes_what_others_read(recording, tmp_path):
+def test_the_command_accepts_a_recording_per_arrangement(recording, tmp_path):
     out, anchors = tmp_path / "c.json", tmp_path / "anchors.toml"
     words = ["survey", *recording, "-o", out, "--save-anchors", f"B={anchors}", "--json"]
     told = json.loads(processes.succeed("calib", *words).stdout)
@@ -398,7 +398,7 @@ def test_the_command_takes_a_recording_an_arrangement_and_writes_what_others_rea
     assert calib.apply(recording[0], known, tmp_path / "corrected.uwb").count == 600
 
 
-def test_places_are_written_for_ros_and_as_a_picture(surveyed, tmp_path):
+def test_positions_are_written_for_ros_and_as_a_figure(surveyed, tmp_path):
     result = surveyed
     result.save_anchors(tmp_path / "a.yaml", arrangement="A")
     text = (tmp_path / "a.yaml").read_text()
@@ -416,7 +416,7 @@ def test_places_are_written_for_ros_and_as_a_picture(surveyed, tmp_path):
             write(tmp_path / name)
 
 
-def test_the_command_says_what_is_not_determined_and_writes_nothing(recording, tmp_path):
+def test_undetermined_surveys_are_refused_with_the_reason(recording, tmp_path):
     done = processes.run("calib", "survey", recording[0], "-o", tmp_path / "c.json", "--json", "--known", "plane")
     assert (done.returncode, json.loads(done.stdout)["undetermined"]) == (1, [[1, 2, 3, 4]])
     assert not (tmp_path / "c.json").exists()
@@ -440,7 +440,7 @@ def test_a_recording_that_is_given_twice_is_refused_under_any_name(recording, tm
         calib.survey(paths)
 
 
-def test_a_curve_is_taken_over_where_powers_do_not_vary():
+def test_a_curve_is_used_if_powers_do_not_vary():
     # Boards about 2.5 m apart: powers within 3 dB, and a bias of several cm that delays would absorb.
     corners = np.array([[0.0, 0.0, 0.0], [2.3, 0.0, 0.0], [1.1, 2.1, 0.0], [1.2, 0.7, 1.9]])
     near = [corners, corners[[1, 2, 3, 0]]]
@@ -472,7 +472,7 @@ def test_a_curve_is_taken_over_where_powers_do_not_vary():
     assert all(sure.delays_std_ns[t] < result.calibration.delays_std_ns[t] for t in planted)
 
 
-def test_a_curve_that_cannot_be_taken_over_is_refused(surveyed):
+def test_unusable_curves_are_refused(surveyed):
     ranges, flight = calib.sample_arrangements(2), calib.fit(calib.sample_flight()).calibration
     for refused, settings, message in (
         (calib.BadInputError, {"curve_from": surveyed.calibration}, "it has no curve"),

@@ -60,7 +60,7 @@ def test_ranges_of_a_flight_that_are_worked_on_in_several_pieces_give_the_same_d
         assert pieces.delays_ns[tag] == pytest.approx(whole.delays_ns[tag], abs=0.01 * std)
 
 
-def test_it_corrects_ranges_of_another_flight_as_any_calibration(known):
+def test_calibrations_without_distances_correct_other_flights(known):
     other = flight(seed=9)
     applied = known.apply(calib.load_ranges(other))
     # Without reflected ranges, the remaining bias is far below that of raw ranges.
@@ -117,7 +117,7 @@ def test_positions_of_anchors_replace_a_known_start():
 
 
 @pytest.mark.slow
-def test_sought_anchors_do_not_spoil_what_a_known_start_tells():
+def test_estimated_anchors_do_not_spoil_a_known_start():
     flown = flight(seconds=10.0, rate=120, anchors=ANCHORS, seed=2)
     result = calib.fit_from_ranges(flown, poses_until_s=6.0, anchors="sought")
     assert np.abs(scores(result)).max() < 3.5
@@ -128,7 +128,7 @@ def test_sought_anchors_do_not_spoil_what_a_known_start_tells():
 
 
 @pytest.mark.slow
-def test_noise_is_not_smaller_by_what_paths_take_of_few_ranges():
+def test_noise_accounts_for_the_unknowns_of_paths():
     # 960 ranges, of whose degrees of freedom paths use an eighth: noise has a standard error of 2.5 %, the mean of
     # three one of 1.4 %. By residuals alone it would be 6 % too small.
     found = [

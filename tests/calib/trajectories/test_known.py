@@ -40,7 +40,7 @@ def by_tape(flown, first, second, off_m=0.0, std_m=0.005):
     return KnownDistance(first, second, float(np.linalg.norm(ends[0] - ends[1])) + off_m, std_m, "0..4")
 
 
-def test_a_tape_tells_what_delays_have_in_common_and_without_it_the_interval_is_wide():
+def test_a_measured_distance_determines_the_common_delay():
     flown = flight(seconds=12.0, standing_s=4.0)
     given: dict[str, Any] = {"poses_until_s": 0.0, "heading_std_deg": 0.0, "minimum_norm": True}
     without = calib.fit_from_ranges(flown, **given)
@@ -60,7 +60,7 @@ def test_a_tape_tells_what_delays_have_in_common_and_without_it_the_interval_is_
     assert result.calibration.provenance["rests_on"]["distances"] == 1
 
 
-def test_a_tape_that_was_misread_is_named_and_others_are_not():
+def test_a_wrong_measured_distance_is_named():
     flown = flight(seconds=8.0, standing_s=4.0)
     # A distance without an arrangement does not state when the bodies stood still.
     tapes = [by_tape(flown, 1, 3, 0.3), by_tape(flown, 2, 5), KnownDistance(2, 3, 2.0, 0.02)]
@@ -73,7 +73,7 @@ def test_a_tape_that_was_misread_is_named_and_others_are_not():
     assert result.calibration.provenance["rests_on"]["distances"] == 2
 
 
-def test_a_tape_counts_as_much_whether_it_holds_for_long_or_short():
+def test_the_weight_of_a_distance_is_independent_of_its_duration():
     bodies = {1: "a", 2: "a", 3: "b", 11: "c", 12: "d"}
     stated = [
         KnownDistance(11, 12, 4.0, 0.01),
@@ -114,7 +114,7 @@ def test_a_distance_that_cannot_be_used_is_named(stated, named):
     assert raised.value.parameter == "distances"
 
 
-def test_heights_tell_on_which_side_of_anchors_in_one_plane_bodies_are():
+def test_heights_resolve_the_mirror_image_of_anchors_in_a_plane():
     flown = flight(seconds=6.0, rate=120, anchors=CEILING, height_off_m=0.05, arm_m=0.0)
     given: dict[str, Any] = {"poses_until_s": 0.0, "attitudes": "none", "minimum_norm": True}
     without = calib.fit_from_ranges(flown, heights="ignored", **given)
@@ -137,7 +137,7 @@ def test_heights_tell_on_which_side_of_anchors_in_one_plane_bodies_are():
     ],
     ids=["too quick", "a pair reflected all along"],
 )
-def test_what_is_wrong_with_a_flight_is_named_and_saved(wrong, said):
+def test_faults_of_a_flight_are_named_and_saved(wrong, said):
     result = calib.fit_from_ranges(flight(seconds=9.0, **wrong), **KNOWN_START)
     assert [warning for warning in result.warnings if said in warning]
     assert result.calibration.provenance["warnings"] == result.warnings
@@ -162,7 +162,7 @@ def test_walls_between_bodies_are_named_and_in_the_intervals(between_m):
 
 
 @pytest.mark.parametrize("blocked", ["bodies", "pairs"])
-def test_reflections_that_two_bodies_share_are_named_though_trajectories_follow_them(blocked):
+def test_common_reflections_of_two_bodies_are_named(blocked):
     flown = flight(seconds=20.0, rate=120, seed=3, blocked=blocked)
     result = calib.fit_from_ranges(flown, poses_until_s=5.0, heading_std_deg=0.0, minimum_norm=True)
     assert bool([text for text in result.warnings if "are reflected together" in text]) == (blocked == "bodies")
@@ -204,7 +204,7 @@ def test_ten_seconds_of_motion_capture_an_imu_and_heights_follow_a_real_flight(f
 
 
 @pytest.mark.slow
-def test_anchors_alone_leave_the_delays_open_and_intervals_say_how_far(flown):
+def test_anchors_alone_give_wide_intervals(flown):
     found = calib.fit_from_ranges(flown, poses_until_s=0.0, minimum_norm=True)
     assert "the ranges determine no delay" in found.warnings[0]
     assert np.isinf(list(found.calibration.delays_std_ns.values())).all()
@@ -212,7 +212,7 @@ def test_anchors_alone_leave_the_delays_open_and_intervals_say_how_far(flown):
 
 
 @pytest.mark.slow
-def test_tags_that_range_with_anchors_only_leave_delays_open_whatever_the_skews_of_clocks():
+def test_tags_that_range_with_anchors_only_leave_delays_undetermined():
     flown = uwbsim.simulate(uwbsim.load("anchors_and_tag/bipartite", {"run.duration_s": 10.0}))
     given: dict[str, Any] = {"poses_until_s": 6.0, "delays_only": True}
     # The common part of all delays is not determined, either, and no value is given.
@@ -279,7 +279,7 @@ def test_attitudes_by_gyroscope_stay_near_those_of_motion_capture(flown_with_imu
 
 
 @pytest.mark.slow
-def test_a_heading_that_is_wrong_by_a_right_angle_is_found_over_the_flight(flown_with_imus):
+def test_a_heading_wrong_by_a_right_angle_is_corrected(flown_with_imus):
     scene = scene_from(flown_with_imus, calib.FlightSettings(poses_until_s=0.0, attitudes="imu")).between(0.0, 4.0)
     known = scene_from(flown_with_imus, calib.FlightSettings(poses_until_s=4.0)).between(0.0, 4.0)
 

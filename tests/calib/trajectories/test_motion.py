@@ -39,7 +39,7 @@ def laid_out():
     return scene, motion, layout, x
 
 
-def test_twice_as_many_control_points_make_the_same_paths(laid_out):
+def test_doubled_control_points_give_the_same_paths(laid_out):
     scene, motion, layout, x = laid_out
     state = motion.state(layout, x)
     finer, again = motion.refined(state)

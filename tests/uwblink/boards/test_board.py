@@ -1,4 +1,4 @@
-"""A board that is deaf for a while is asked once more; one that is dead is called so."""
+"""A board that does not react for a while is asked once more; one that does not answer at all is reported as dead."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from uwblink.wire.codec import encode
 
 
 class Deaf:
-    """A board that takes in what is written to it only from `wakes_s` on; time passes while it is read."""
+    """A board that reads its input only from `wakes_s` on; time advances while it is read."""
 
     name = "port"
 
@@ -22,7 +22,7 @@ class Deaf:
     def read(self, timeout_s):
         if self.heard and self.time_s + timeout_s >= self.wakes_s:
             self.time_s = max(self.time_s, self.wakes_s)
-            # The firmware carries out only the last of the commands that wait.
+            # The firmware executes only the last of the waiting commands.
             last, self.heard = self.heard[-1], []
             return self.answers[last]
         self.time_s += timeout_s
@@ -38,7 +38,7 @@ class Deaf:
 ANSWERS = {b"C00\r": b"R00\r\n", b"C01\r": b"R01|7\r\n", b"C06|\x01\x00x\r": b"R06\r\n"}
 
 
-def test_a_board_that_is_deaf_for_300_ms_is_asked_once_more():
+def test_a_board_without_reaction_for_300_ms_is_asked_once_more():
     assert Board(Deaf(0.3, ANSWERS)).id == 7
 
 
@@ -49,7 +49,7 @@ def test_a_broadcast_is_not_sent_twice():
     assert "must be unplugged" not in str(caught.value), "it came back"
 
 
-def test_only_a_board_that_answers_nothing_for_a_second_is_called_dead():
+def test_boards_without_an_answer_for_a_second_are_reported_as_dead():
     deaf = Deaf(1e9, ANSWERS)
     said = r"b'C01.* within 150 ms; heard nothing; then no answer.*1000 ms.*must be unplugged\Z"
     with pytest.raises(NoAnswerError, match=said):
@@ -57,7 +57,7 @@ def test_only_a_board_that_answers_nothing_for_a_second_is_called_dead():
     assert deaf.time_s == pytest.approx(1.15)
 
 
-def test_the_answer_to_the_second_asking_may_fail_too():
+def test_the_second_request_may_fail():
     class Once(Deaf):
         def read(self, timeout_s):
             data = super().read(timeout_s)
@@ -67,7 +67,7 @@ def test_the_answer_to_the_second_asking_may_fail_too():
         Board(Once(0.0, ANSWERS)).request(m.GetId())
 
 
-# The driver's side of a conversation, without ports: outcomes, late replies, fences, times, what may be sent.
+# The driver's side of a conversation, without ports: outcomes, late replies, fences, times, allowed commands.
 
 
 REPORT = (
@@ -97,7 +97,7 @@ def test_a_line_of_failure_does_not_end_a_command_that_cannot_fail():
 CIR = encode(m.Cir(1, 2, 747_015, tuple(range(1016))))
 
 
-def test_a_patient_connection_stays_patient():
+def test_long_time_outs_of_a_connection_are_kept():
     connection = Connection("port", answer_s=2.0)
     for sent_s, heard, heard_s in ((0.0, b"", 2.0), (3.0, b"R00\r\n", 3.1)):
         connection.send(FENCE, sent_s)
@@ -114,14 +114,14 @@ def test_the_last_60_bytes_are_quoted():
     assert (type(error), str(error).partition("heard ")[2]) == (NoAnswerError, f"'{'a' * 39}{'b' * 21}'")
 
 
-def test_only_an_impulse_response_that_was_asked_for_keeps_the_board_quiet():
+def test_only_requested_impulse_responses_block_the_board():
     connection = asked(m.RangeCommand(2))
     connection.receive(REPORT, 1.0)
     assert connection.ready_s(1.0) == 0.0
     with_cir = asked(m.RangeCommand(2, get_cir=True))
     with_cir.receive(REPORT, 1.0)
     assert (with_cir.ready_s(1.0), with_cir.ready_s(1.02)) == (pytest.approx(0.030), pytest.approx(0.010))
-    # Once it is there, the report of a target may follow within 3 ms.
+    # After it, the report of a target may follow within 3 ms.
     with_cir.receive(CIR, 1.028)
     assert (with_cir.ready_s(1.03), with_cir.ready_s(1.04)) == (pytest.approx(0.003), 0.0)
 
@@ -130,7 +130,7 @@ def test_only_an_impulse_response_that_was_asked_for_keeps_the_board_quiet():
     ("command", "what"),
     [(m.RangeCommand(2), "ranging with 2"), (m.Broadcast(b"x"), "the broadcast")],
 )
-def test_what_failed_is_named_and_each_line_quoted_once(command, what):
+def test_failures_are_named_and_lines_quoted_once(command, what):
     connection = asked(command)
     warned = b"WARNING 0xC: TWR message is firing an interrupt when it shouldn't be.\r\n"
     assert connection.receive(warned + warned, 0.01)[1] is None
@@ -141,7 +141,7 @@ def test_what_failed_is_named_and_each_line_quoted_once(command, what):
     assert not connection.doubtful
 
 
-def test_a_report_answers_only_who_asked_for_that_target_and_that_protocol():
+def test_reports_answer_only_requests_of_their_target_and_protocol():
     single = REPORT.replace(b"|1332123700|2454699099|", b"|0|0|")
     for double_sided, not_asked, answer in (
         (False, single.replace(b"R05|2|", b"R05|3|"), single),

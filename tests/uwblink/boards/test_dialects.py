@@ -1,4 +1,4 @@
-"""Boards of other firmware, which print ranges: fake ones on pseudo-terminals, recorded, streamed, corrected."""
+"""Boards of other firmware that print ranges: imitated on pseudo-terminals, recorded, streamed, corrected."""
 
 import json
 import math
@@ -20,7 +20,7 @@ from uwblink.errors import ArgumentError, ImportTableError, PlanError
 from uwblink.importers import read_source
 from uwblink.importers.devices import LINES
 
-# What each board prints for a range of one metre to one device and of two metres to another; made from descriptions.
+# Output of each board for a range of one metre to one device and of two metres to another, from descriptions.
 BOTH = "from: 6018\t Range: 1.00 m\t RX power: -78.50 dBm\r\nfrom: 6019\t Range: 2.00 m\t RX power: -80.00 dBm\r\n"
 FORMS = {
     "dwm1001-lec": (
@@ -36,7 +36,7 @@ FORMS = {
 
 @contextmanager
 def printing(text, *, asked=b"", banner=""):
-    """Serve a board that prints a text some 25 times a second, after it was asked for it; gives the port's name."""
+    """Serve a board that prints a text 25 times a second after it was asked; yield the name of the port."""
     terminal, end = Terminal(), threading.Event()
 
     def run():
@@ -45,7 +45,7 @@ def printing(text, *, asked=b"", banner=""):
         while not end.is_set():
             heard += terminal.read()
             if asked in heard:
-                # In two pieces, as serial lines come.
+                # In two pieces, like lines of a serial port.
                 data = text.encode()
                 terminal.write(data[:9])
                 time.sleep(0.01)
@@ -63,14 +63,14 @@ def printing(text, *, asked=b"", banner=""):
 
 
 def by_log(tmp_path, text, map_text):
-    """Return the exchanges of an import of a log by a map with this text."""
+    """Return the exchanges of an import of a log with a map of this text."""
     (tmp_path / "board.log").write_text(text)
     (tmp_path / "m.toml").write_text(map_text)
     return read_source(tmp_path / "board.log", importer="csv", map_file=tmp_path / "m.toml").exchanges
 
 
 @pytest.mark.parametrize("name", FORMS)
-def test_what_a_board_prints_is_recorded(tmp_path, name):
+def test_printed_ranges_are_recorded(tmp_path, name):
     text, devices = FORMS[name]
     start = DIALECTS[name].start
     with printing(text, asked=start, banner="\r\n DWM1001 TWR Real Time Location System\r\n\r\ndwm> \r\n") as port:
@@ -79,11 +79,11 @@ def test_what_a_board_prints_is_recorded(tmp_path, name):
     found = uwblink.load(tmp_path / "r.uwb")
     e, names = found.exchanges, {tag.tag: tag.body for tag in found.tags}
     called = [names[k] if isinstance(devices[0], str) else k for k in e.target.tolist()]
-    # Lines of these forms say who ranged; of the others it is the board at the port.
+    # Some lines state who ranged; for the others it is the board at the port.
     own = 7 if name in ("at-range", "trek-corrected") else 40
     told = {*zip(e.initiator.tolist(), called, e.range_m.round(9).tolist(), strict=True)}
     assert told == {(own, devices[0], 1.0), (own, devices[1], 2.0)}
-    # The import of the same lines as a log, which another program reads (DuckDB), says the same.
+    # The import of the same lines as a log, by another program (DuckDB), gives the same.
     constant = "" if "from_id" in LINES[name]["line"] else "[constants]\nfrom_id = 40\n"
     logged = by_log(tmp_path, text * 3, f'line = "{name}"\n{constant}')
     for column in ("initiator", "range_m"):
@@ -91,7 +91,7 @@ def test_what_a_board_prints_is_recorded(tmp_path, name):
     assert (len(e) >= 10, found.meta["dialect"]) == (True, name)
     if name == "arduino":
         assert set(e.fpp2_dbm.tolist()) == {-78.5, -80.0}
-    # The time is the host's.
+    # The time is that of the host.
     assert abs(e.time_ns[0] * 1e-9 - time.time()) < 120
     assert np.all(np.diff(e.time_ns) >= 0)
 
@@ -109,8 +109,8 @@ def test_a_map_of_lines_serves_as_for_logs_and_a_stream_is_corrected(tmp_path):
     assert [row["corrected_m"] for row in rows] == pytest.approx([1.25] * len(rows), abs=1e-6)
 
 
-def test_a_map_means_for_boards_what_it_means_for_their_log(tmp_path):
-    """Units of a place, a constant initiator, numbers of words, values without a range, and the sign of powers."""
+def test_maps_have_the_same_effect_for_boards_and_logs(tmp_path):
+    """Units of a position, a constant initiator, ids of words, values without a range, and the sign of powers."""
     keys = 'line = "{to_id} {range_mm} {rxp2}"\nmissing = [65535]\n[units]\npower = "-dBm"\n[constants]\nfrom_id = 9\n'
     lines = "left 1500 80.5\nright 2500 81.5\nright 65535 99.0\n"
     logged = by_log(tmp_path, lines, f"{keys}[ids]\nleft = 40\nright = 41\n")
@@ -177,7 +177,7 @@ def test_a_board_that_is_unplugged_keeps_what_was_recorded(tmp_path):
     assert {tag.tag: tag.body for tag in found.tags} == {1: "tag1", 5: "tag5"}
 
 
-def test_a_dialect_of_ones_own_comes_by_an_entry_point_and_words_get_numbers_of_their_own():
+def test_dialects_come_by_entry_points_and_words_get_ids():
     def parse(lines):
         cells = (line.partition("=") for line in lines)
         return [PrintedRange(to_id=who, range_m=float(far)) for who, _, far in cells if far]
@@ -188,7 +188,7 @@ def test_a_dialect_of_ones_own_comes_by_an_entry_point_and_words_get_numbers_of_
             seen = Printed()
             batches = uwblink.boards.printed_ranges([port], dialect_of("mine"), ids=[1], duration_s=1.0, seen=seen)
             found = [turn for turns in batches for turn in turns]
-        # Words have numbers beside that of the board, in the order in which they are heard.
+        # Words have ids after that of the board, in the order of their appearance.
         assert sorted(seen.numbers.values()) == [1, 2, 3]
         named = {number: name for name, number in seen.numbers.items()}
         told = {(named[turn.pair[1]], turn.report.range_m) for turn in found}
@@ -200,7 +200,7 @@ def test_a_dialect_of_ones_own_comes_by_an_entry_point_and_words_get_numbers_of_
 
 
 def calibrated(folder, initiator, target):
-    """Write a calibration that takes 25 cm off ranges of a pair."""
+    """Write a calibration that subtracts 25 cm from ranges of a pair."""
     own = calib.Ranges.from_arrays(
         np.tile([1.25, 2.25, 3.25], 40),
         initiator=initiator,
@@ -222,7 +222,7 @@ def test_the_page_shows_printed_ranges_and_their_corrections(tmp_path):
     assert f"{done.exchanges} ranges of 2 devices" in str(done)
     for text in ("40&nbsp;&rarr;&nbsp;6018", "<td>1.000</td><td>0.750</td>", 'polyline class="corrected"'):
         assert text in body
-    # No share of exchanges succeeded: of those that failed nothing is printed.
+    # There is no share of successful exchanges, because failed ones are not printed.
     assert "%" not in body
     with printing(other) as port, LivePage(tmp_path / "s.uwb", correct=correct) as page:
         how = {"ids": [40], "duration_s": 30, "watch": page.watch, "listeners": [page]}

@@ -1,4 +1,4 @@
-"""Listeners of a recorder, in virtual time: they hear what the file gets."""
+"""Listeners of a recorder, in virtual time: they receive all that is written to the file."""
 
 import gc
 import sys
@@ -28,11 +28,11 @@ def recorded(path, *listeners, ports=None, seconds=2.0):
     return record_bench(path, None, ports, duration_s=seconds, listeners=listeners)
 
 
-def test_a_function_hears_every_message_that_the_file_gets(tmp_path):
+def test_listeners_get_every_message_in_the_file(tmp_path):
     heard: list[uwblink.Heard] = []
     done = recorded(tmp_path / "f.uwb", heard.append)
     reports = [h for h in heard if isinstance(h.message, RangeReport)]
-    # In virtual time at 50 Hz none is missing.
+    # In virtual time at 50 Hz, none is missing.
     assert len(reports) == done.exchanges == done.tried == pytest.approx(100, abs=1)
     e = uwblink.load(tmp_path / "f.uwb").exchanges
     told = [(h.board, h.message.tx1) for h in reports]
@@ -53,7 +53,7 @@ class Everything(uwblink.Listener):
         self.faults.append(fault)
 
 
-def test_a_listener_is_told_bytes_turns_and_faults(tmp_path):
+def test_listeners_get_bytes_turns_and_faults(tmp_path):
     ports, listener = VirtualPorts(bench_scenario(), lost_share=0.4), Everything()
     done = recorded(tmp_path / "f.uwb", listener, ports=ports, seconds=2.0)
     good = sum(turn.report is not None for turn in listener.turns)
@@ -95,14 +95,14 @@ def test_a_recorder_needs_no_file(tmp_path):
         ([], float("nan"), uwblink.UwblinkError, "duration_s"),
     ],
 )
-def test_listeners_and_durations_that_are_none_are_refused(tmp_path, listeners, seconds, error, said):
+def test_wrong_listeners_and_durations_are_refused(tmp_path, listeners, seconds, error, said):
     with pytest.raises(error, match=said):
         recorded(tmp_path / "f.uwb", *listeners, seconds=seconds)
     assert list(tmp_path.iterdir()) == []
 
 
 def damaged(ports, hit):
-    """Damage what comes from board 1 in the way that `hit` says."""
+    """Damage the output of board 1 by the function `hit`."""
     arrived = ports.bench.send
 
     def send(time_ns, tag, data):
@@ -112,11 +112,11 @@ def damaged(ports, hit):
 
 
 def test_one_damaged_line_is_one_fault(tmp_path):
-    """An impulse response of 6000 bytes in 22 pieces, of which one byte in the middle is damaged."""
+    """An impulse response of 6000 bytes in 22 pieces, with one damaged byte in the middle."""
     ports, seen = VirtualPorts(bench_scenario()), []
 
     def hit(data):
-        # The fifth piece of each response; bars inside it are places where nothing starts.
+        # The fifth piece of each response; bars within it are not the start of a message.
         seen.append(data)
         number = sum(d.startswith((b"|", b"S10")) for d in seen)
         return data[:10] + b"x" + data[11:] if data.startswith(b"|") and number % 21 == 5 else data
@@ -127,7 +127,7 @@ def test_one_damaged_line_is_one_fault(tmp_path):
     assert (done.exchanges, done.tried, done.faults) == (20, 20, {"garbage": 20})
 
 
-# The writer of a live recording: what cannot be written is known at the start, or within a second.
+# The writer of a live recording: failures are noticed at the start, or within a second.
 
 
 @pytest.fixture
@@ -144,7 +144,7 @@ def size(path):
 
 
 def until(true):
-    """Wait for something that another thread does."""
+    """Wait for an effect of another thread."""
     end_s = time.monotonic() + 60.0
     while not true():
         assert time.monotonic() < end_s
@@ -152,7 +152,7 @@ def until(true):
 
 
 def test_rows_are_committed_while_a_long_log_is_put_into_the_file(live, monkeypatch):
-    """DuckDB does that within a commit where nobody did it before, and what comes meanwhile is not in the file."""
+    """DuckDB does this within a commit unless it was done before; data that arrive meanwhile are not in the file."""
     begun, over = threading.Event(), threading.Event()
     monkeypatch.setattr(writing, "LONG_LOG", 20_000)
 
@@ -185,7 +185,7 @@ def test_a_log_stays_short_and_everything_is_in_the_file(live, monkeypatch):
 
 
 @pytest.mark.parametrize("error", [MemoryError("no more"), RuntimeError("a bug"), RecordingError("disk full")])
-def test_whatever_ends_the_writing_is_told_within_a_second(live, monkeypatch, error):
+def test_failures_of_writing_are_reported_within_a_second(live, monkeypatch, error):
     writer = RecordingWriter(live)
 
     def failing(_recording, _table, _rows):
@@ -195,14 +195,14 @@ def test_whatever_ends_the_writing_is_told_within_a_second(live, monkeypatch, er
     writer.on_bytes(5, "port", "in", b"x")
     begun = time.monotonic()
     with pytest.raises(RecordingError, match=str(error)):
-        while time.monotonic() < begun + 10.0:  # ten for a busy machine; it takes one period of the writer
+        while time.monotonic() < begun + 10.0:  # ten, because of other load; it takes one period of the writer
             writer.check()
             time.sleep(0.01)
     with pytest.raises(RecordingError, match=str(error)):
         writer.close()
 
 
-# A recorder that runs for hours holds no more than one that runs for seconds, and each commit does the same work.
+# A recorder that runs for hours needs no more memory than one that runs for seconds, and commits stay equal.
 
 
 WARM, LATER, LONG = 1_100, 2_300, 2_400
@@ -210,7 +210,7 @@ EVERY = 100
 
 
 class Committing(Listener):
-    """Commits after every so many exchanges, in the loop itself, and notes what each commit asked of the database."""
+    """Commits after every few exchanges, in the loop itself, and stores the statements of each commit."""
 
     def __init__(self, recording, every=EVERY):
         self.recording, self.every, self.batch, self.exchanges = recording, every, [], 0
@@ -270,8 +270,8 @@ def test_nothing_grows_with_the_recording(tmp_path, statements):
         assert recorder.progress.exchanges >= LONG
         assert recording.count("exchanges") == LONG
     (objects, blocks), (objects_later, blocks_later) = held.values()
-    # Each exchange that stayed would be some objects and blocks of memory more, and there were 1,200 in between; of a
-    # pair the last 1,000 are kept.
+    # Each exchange that stays would be some objects and blocks of memory more, and there were 1,200; the last 1,000 of
+    # a pair are kept.
     assert objects_later - objects < 200
     assert blocks_later - blocks < 1_000
     assert (len(set(committing.rows)), len({tuple(asked) for asked in committing.asked})) == (1, 1)

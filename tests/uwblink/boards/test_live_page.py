@@ -1,4 +1,4 @@
-"""The live page: what it shows, to whom, and in a browser where there is one."""
+"""The live page: its content, its access rules, and its display in a browser if there is one."""
 
 import contextlib
 import re
@@ -36,7 +36,7 @@ def fetch(page, path="", method="GET", **headers):
 
 
 class Looking(uwblink.Listener):
-    """Looks at the page when so many exchanges have been told of."""
+    """Fetches the page after some number of exchanges."""
 
     def __init__(self, at, look):
         self.left, self.look, self.seen = at, look, []
@@ -78,7 +78,7 @@ def test_the_page_shows_rates_success_ranges_power_faults_disk_and_queue(tmp_pat
 
 
 def test_the_picture_is_the_last_minute(tmp_path):
-    """Host time is large."""
+    """Host time is a large number."""
     began_ns = 1_790_000_000_000_000_000
     with LivePage(tmp_path / "f.uwb") as page:
         progress = Progress(start_ns=began_ns, pairs={(1, 2): PairState()})
@@ -90,18 +90,18 @@ def test_the_picture_is_the_last_minute(tmp_path):
         text = page.body()
     drawn = re.findall(r"([\d.]+),([\d.]+)", re.search(r'points="([^"]*)"', text)[1])
     across, down = ([float(place[k]) for place in drawn] for k in (0, 1))
-    # 61 ranges of a minute, a second apart, over 254 of 260 units; longer and longer, so higher and higher.
+    # 61 ranges of a minute, a second apart, over 254 of 260 units; they become longer, so they are drawn higher.
     assert len(drawn) == 61
     assert across == pytest.approx([3 + 254 * k / 60 for k in range(61)], abs=0.06)
     assert down == pytest.approx([41 - 38 * k / 60 for k in range(61)], abs=0.06)
-    # The last range came six seconds ago.
+    # The last range was six seconds ago.
     for words in ("range from 3.290 to 3.890 m", "<small>3.29 to 3.89 m, 60 s</small>", "class='silent'"):
         assert words in text
     assert "corrected" not in text, "there is no calibration"
 
 
-def test_success_is_that_of_ten_seconds_spread_is_noise_and_gaps_are_gaps(tmp_path):
-    """20 s of ranges of a moving tag with planted noise, a gap of 5 s; in the last 10 s every second turn fails."""
+def test_the_page_shows_success_of_ten_seconds_noise_and_gaps(tmp_path):
+    """20 s of ranges of a moving tag with planted noise, and a gap of 5 s; in the last 10 s every second turn fails."""
     began_ns, noise = 1_790_000_000_000_000_000, np.random.default_rng(7).normal(0, 0.05, 200)
     progress = Progress(start_ns=began_ns, time_s=25.0)
     for k in range(200):
@@ -114,7 +114,7 @@ def test_success_is_that_of_ten_seconds_spread_is_noise_and_gaps_are_gaps(tmp_pa
         page.watch(progress)
         cells = re.findall(r"<td>(.*?)</td>", page.body())
     assert cells[2] == "50 %", "the whole recording has 67 %"
-    # 198 second differences know a spread to a tenth.
+    # 198 second differences determine a spread to a tenth.
     assert float(cells[5]) == pytest.approx(5.0, rel=0.25)
     assert cells[-1].count("<polyline") == 2
 
@@ -135,7 +135,7 @@ def test_an_unplugged_board_stays_named_until_it_is_back(tmp_path):
     assert "unplugged since" not in back
 
 
-def test_what_boards_say_cannot_become_part_of_the_page(tmp_path):
+def test_output_of_boards_is_escaped_in_the_page(tmp_path):
     progress = Progress()
     progress.on_fault(Fault(0, "1", "text", "<script>alert(1)</script>"))
     with LivePage(tmp_path / "<f>.uwb") as page:
@@ -146,7 +146,7 @@ def test_what_boards_say_cannot_become_part_of_the_page(tmp_path):
         assert words in text
 
 
-def test_the_page_is_for_this_computer_alone(tmp_path):
+def test_the_page_is_served_to_this_computer_only(tmp_path):
     with LivePage(tmp_path / "f.uwb") as page:
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", page.url)
         headers, text = fetch(page)
@@ -178,7 +178,7 @@ def connected(page):
     return socket.create_connection(("127.0.0.1", port_of(page)), timeout=20)
 
 
-def test_connections_that_are_reset_or_hold_garbage_print_nothing_and_end_nothing(tmp_path, capfd):
+def test_faulty_connections_have_no_effect(tmp_path, capfd):
     requests = (
         b"",
         b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n",
@@ -189,7 +189,7 @@ def test_connections_that_are_reset_or_hold_garbage_print_nothing_and_end_nothin
     with LivePage(tmp_path / "f.uwb") as page:
         for request in requests * 8:
             with connected(page) as client:
-                # Closing sends a reset, where an answer comes to nobody.
+                # Closing sends a reset if an answer arrives later.
                 client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
                 with contextlib.suppress(OSError):
                     client.sendall(request)
@@ -199,15 +199,15 @@ def test_connections_that_are_reset_or_hold_garbage_print_nothing_and_end_nothin
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_connection_that_says_nothing_is_closed(tmp_path, monkeypatch):
+def test_silent_connections_are_closed(tmp_path, monkeypatch):
     monkeypatch.setattr(live_page._Handler, "timeout", 0.05)
     with LivePage(tmp_path / "f.uwb") as page, connected(page) as client:
         client.sendall(b"GET / HT")
         assert client.recv(100) == b"", "the other end hung up"
 
 
-def test_what_a_page_fetches_names_the_recording_of_whoever_serves_it_now(tmp_path):
-    """The next recorder may have the same port, and the page of the one before is still open."""
+def test_pages_of_an_earlier_recorder_are_detected(tmp_path):
+    """The next recorder may have the same port while the page of the previous one is still open."""
     with LivePage(tmp_path / "old.uwb") as page:
         _, whole = fetch(page)
     with LivePage(tmp_path / "new.uwb", port=port_of(page)) as page:
@@ -217,7 +217,7 @@ def test_what_a_page_fetches_names_the_recording_of_whoever_serves_it_now(tmp_pa
     assert "old.uwb" not in before + after, "what is not fetched again says nothing of a recording"
 
 
-def test_a_browser_shows_it_and_keeps_it_fresh(tmp_path):
+def test_a_browser_shows_the_live_page_and_updates_it(tmp_path):
     """Headless Chromium runs the script under the page's own policy, and fetches the body again."""
 
     def look():
@@ -249,7 +249,7 @@ def test_a_calibration_s_correction_is_found_by_its_entry_point(tmp_path):
     assert correct(flight.exchanges)["corrected_m"].tolist() == expected.tolist()
 
 
-def test_the_command_says_where_the_page_is_and_serves_it_while_it_records(tmp_path):
+def test_the_command_prints_the_address_of_the_page_and_serves_it(tmp_path):
     with served() as server:
         ports = [str(name) for name in server.names.values()]
         words = [str(BIN / "uwblink"), "record", *ports, "-o", str(tmp_path / "f.uwb"), "--pairs", "all", "--live"]

@@ -1,4 +1,4 @@
-"""The recorder while its machine misbehaves: clocks are set, the process is stopped, its file or folder goes away."""
+"""The recorder during faults of the computer: clocks are set, the process is stopped, its file or folder is removed."""
 
 import itertools
 import os
@@ -33,7 +33,7 @@ HOUR_NS = 3600 * 10**9
 
 
 class After(Listener):
-    """Does things after so many turns of the plan."""
+    """Runs functions after some numbers of turns of the plan."""
 
     def __init__(self, **what):
         self.turns, self._what = 0, {int(name[1:]): do for name, do in what.items()}
@@ -48,7 +48,7 @@ def exchanges_of(path):
     return found.exchanges, [fault.kind for fault in found.faults]
 
 
-def test_an_hour_forward_and_back_on_the_wall_changes_no_time_in_the_file(tmp_path, monkeypatch):
+def test_setting_the_host_clock_changes_no_times(tmp_path, monkeypatch):
     path, set_by, plain = tmp_path / "f.uwb", [0], time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: plain() + set_by[0])
     monkeypatch.setattr(time, "time", lambda: time.time_ns() * 1e-9)
@@ -59,11 +59,11 @@ def test_an_hour_forward_and_back_on_the_wall_changes_no_time_in_the_file(tmp_pa
         record(ports, path, RangingPlan(), duration_s=60.0, listeners=[clock], stop=lambda: clock.turns > 60)
     time_ns = uwblink.load(path).exchanges.time_ns
     assert len(time_ns) > 50
-    # As long as the test took, and not an hour.
+    # The duration of the test, and not an hour.
     assert before - 10**9 < time_ns.min() < time_ns.max() < plain() + 10**9
 
 
-def test_host_time_goes_on_while_the_computer_is_suspended(monkeypatch):
+def test_host_time_continues_during_suspension(monkeypatch):
     boot = getattr(time, "CLOCK_BOOTTIME", None)
     if boot is None:
         pytest.skip("this system has no clock that counts suspension")
@@ -74,7 +74,7 @@ def test_host_time_goes_on_while_the_computer_is_suspended(monkeypatch):
 
 
 class Suspended(VirtualPorts):
-    """Ports of a computer that is suspended for five seconds, while the boards go on."""
+    """Ports of a computer that is suspended for five seconds, while the boards continue."""
 
     left_out_ns = 5 * 10**9
     at_ns = 10**9
@@ -87,12 +87,12 @@ class Suspended(VirtualPorts):
         return ready
 
 
-def test_five_seconds_of_suspension_are_a_gap_and_nothing_else(tmp_path):
+def test_suspension_is_only_a_gap(tmp_path):
     done = record_bench(tmp_path / "f.uwb", None, Suspended(bench_scenario()), duration_s=8.0)
     exchanges, kinds = exchanges_of(tmp_path / "f.uwb")
     gaps = np.diff(np.sort(exchanges.time_ns)) * 1e-9
     assert 4.9 < gaps.max() < 5.2
-    # No burst makes up for the gap. The exchange in which it fell may have failed, or its report waited all the while.
+    # No burst compensates the gap. The exchange at its start may have failed, or its report waited during the gap.
     assert len(exchanges) == pytest.approx(150, abs=5)
     assert np.median(gaps) == pytest.approx(0.02, rel=0.1)
     assert np.sort(gaps)[1] > 0.01
@@ -105,7 +105,7 @@ def live(tmp_path):
         yield recording
 
 
-def test_a_recorder_that_was_stopped_does_not_blame_the_disk(live, monkeypatch):
+def test_a_stopped_recorder_does_not_report_a_slow_disk(live, monkeypatch):
     plain, later = time.monotonic, [0.0]
     with RecordingWriter(live) as writer:
         writer.check()
@@ -116,13 +116,13 @@ def test_a_recorder_that_was_stopped_does_not_blame_the_disk(live, monkeypatch):
     assert len(live.frames()) == 1
 
 
-def test_a_disk_that_is_late_is_still_told(live, monkeypatch):
+def test_a_slow_disk_is_reported(live, monkeypatch):
     plain, later = time.monotonic, [0.0]
     with RecordingWriter(live) as writer:
         monkeypatch.setattr(time, "monotonic", lambda: plain() + later[0])
         monkeypatch.setattr(writer, "_write", lambda: None)
         with pytest.raises(RecordingError, match=r"the disk is 2\d s late"):
-            for _ in range(60):  # the loop asks all the while
+            for _ in range(60):  # the loop asks during all this time
                 later[0] += 0.5
                 writer.check()
         monkeypatch.undo()
@@ -130,7 +130,7 @@ def test_a_disk_that_is_late_is_still_told(live, monkeypatch):
 
 
 @pytest.mark.parametrize("replaced", [False, True])
-def test_a_file_that_is_removed_under_the_recorder_is_told_within_a_second(tmp_path, replaced):
+def test_a_removed_file_is_reported_within_a_second(tmp_path, replaced):
     path = tmp_path / "f.uwb"
     begun = []
 
@@ -142,7 +142,7 @@ def test_a_file_that_is_removed_under_the_recorder_is_told_within_a_second(tmp_p
 
     with served() as server, pytest.raises(RecordingError, match=r"f\.uwb: was removed or replaced during"):
         record(server.names.values(), path, RangingPlan(), duration_s=60.0, listeners=[After(t20=remove)])
-    assert time.monotonic() < begun[0] + 20.0  # a second on a machine that has nothing else to do
+    assert time.monotonic() < begun[0] + 20.0  # a second on an idle machine
     assert not replaced or path.read_text() == "mine"
 
 
@@ -150,8 +150,10 @@ NOBODY = 65534
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give its rights away, and take a folder's from another")
-def test_a_folder_made_read_only_under_the_recorder_takes_nothing_away():
-    """By an ordinary user, whose right to the folder goes while it records: it says so, and nothing is lost."""
+def test_a_read_only_folder_loses_no_data():
+    """An ordinary user loses the right to write to the folder during the recording: the recorder reports it, and
+    nothing is lost.
+    """
     with TemporaryDirectory(dir="/tmp") as place:
         folder, path = Path(place), Path(place) / "f.uwb"
         folder.chmod(0o777)
@@ -191,7 +193,7 @@ def test_two_recorders_cannot_have_one_file(tmp_path):
     assert (len(exchanges) > 50, kinds) == (True, [])
 
 
-# What docs/security.md says of a device on the cable, held against devices that try otherwise.
+# Statements of docs/security.md on a device at the cable, tested with hostile devices.
 
 
 END = 2**32 - 1
@@ -217,7 +219,7 @@ CONTROLS = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f]")
 
 @contextmanager
 def hostile(board, link, said):
-    """A device that gives its id when it is asked, and anything at all to every other command; gives what it got."""
+    """A device that returns its id when asked, and random bytes for every other command; yields its input."""
     terminal, over, got, answers = Terminal(link), threading.Event(), [], itertools.cycle(said)
 
     def serve():
@@ -239,11 +241,11 @@ def hostile(board, link, said):
         terminal.unplug()
 
 
-def test_a_device_neither_steers_the_terminal_nor_ends_the_recorder_nor_writes_elsewhere(tmp_path):
+def test_hostile_devices_have_no_effect(tmp_path):
     places = {board: tmp_path / "ports" / f"tag{board}" for board in (1, 2)}
     out = tmp_path / "out" / "f.uwb"
     out.parent.mkdir()
-    # All of it after the first command: a board that does not answer is asked seldom.
+    # All after the first command: a board that does not answer is asked rarely.
     said = [b"".join(SAID), *SAID]
     with hostile(1, places[1], said) as got, hostile(2, places[2], said):
         words = ["record", *places.values(), "-o", out, "--pairs", "all", "--duration", "1"]
@@ -259,7 +261,7 @@ def test_a_device_neither_steers_the_terminal_nor_ends_the_recorder_nor_writes_e
 
 
 @pytest.mark.parametrize(("command", "rest"), [("test", []), ("twr", ["2"]), ("cir", ["2"])])
-def test_a_command_to_a_hostile_device_ends_in_a_line(tmp_path, command, rest):
+def test_commands_to_hostile_devices_end_with_one_line(tmp_path, command, rest):
     with hostile(1, tmp_path / "tag1", SAID[:6]):
         done = processes.run("uwblink", command, tmp_path / "tag1", *rest, timeout=120)
     assert done.returncode in (0, 2)
@@ -268,7 +270,7 @@ def test_a_command_to_a_hostile_device_ends_in_a_line(tmp_path, command, rest):
 
 
 class Flooding:
-    """Ports in virtual time of two boards that answer with their ids, and then with zeros without an end."""
+    """Ports in virtual time of two boards that answer with their ids, and then with endless zeros."""
 
     def __init__(self):
         self.time_s, self.said, self.piece = 0.0, 0, bytes(4096)
@@ -311,8 +313,8 @@ class FloodingPort:
         pass
 
 
-def test_zeros_without_an_end_are_faults_and_no_memory():
-    """Nothing is written here, so that only the loop is measured."""
+def test_endless_zeros_are_faults_and_need_no_memory():
+    """Nothing is written, so that only the loop is measured."""
     ports, seen = Flooding(), Progress()
     recorder = Recorder({1: "1", 2: "2"}, uwblink.RangingPlan(((1, 2),)), ((1, 2),), [seen], ports=ports)
     tracemalloc.start()

@@ -1,4 +1,4 @@
-"""Ports: what cannot be opened says why, and a port can be a URL."""
+"""Ports: errors state why a port cannot be opened, and a port can be a URL."""
 
 import errno
 import json
@@ -30,7 +30,7 @@ from uwblink.wire.codec import encode
         ("socket://127.0.0.1:1", PortError, "cannot be opened"),
     ],
 )
-def test_what_cannot_be_opened(tmp_path, name, error, said):
+def test_ports_that_cannot_be_opened_are_named(tmp_path, name, error, said):
     (tmp_path / "file").write_text("x")
     with pytest.raises(error, match=said.format(here=tmp_path)):
         SerialPort(name.format(here=tmp_path))
@@ -48,7 +48,7 @@ def test_permission_denied_names_the_group(tmp_path):
     assert f"join the group {(tmp_path / 'port').group()}" in str(error)
 
 
-def test_a_second_opening_is_refused_and_a_lost_port_says_so():
+def test_a_port_opens_once_and_a_lost_port_is_an_error():
     with served() as server:
         port = SerialPort(server.names[1])
         with pytest.raises(PortBusyError, match="another process"):
@@ -62,7 +62,7 @@ def test_a_second_opening_is_refused_and_a_lost_port_says_so():
 
 @pytest.fixture
 def answerer():
-    """A board behind TCP that knows only its id."""
+    """A board behind TCP that only has an id."""
     listening = socket.create_server(("127.0.0.1", 0))
 
     def serve():
@@ -96,7 +96,7 @@ def test_bytes_from_before_the_opening_are_not_taken_for_answers():
             assert board.id == 1
 
 
-# Ranging plans: files, turns, and what is wrong with them.
+# Ranging plans: files, turns, and errors.
 
 
 def written(tmp_path, text):
@@ -137,7 +137,7 @@ def test_all_leaves_out_pairs_on_one_body():
         ("pairs = [", "not valid TOML"),
     ],
 )
-def test_plans_that_cannot_be_played(tmp_path, text, fragment):
+def test_wrong_plan_files_are_refused(tmp_path, text, fragment):
     with pytest.raises(PlanError, match=one_line("plan.toml", fragment)):
         load_plan(written(tmp_path, text))
 
@@ -166,6 +166,6 @@ def test_tags_come_from_a_scenario_too(tmp_path):
         ({"pairs": "some"}, "pairs: found 'some'"),
     ],
 )
-def test_plans_that_cannot_be_are_refused_where_they_are_made(given, text):
+def test_wrong_plans_are_refused(given, text):
     with pytest.raises(PlanError, match=text):
         RangingPlan(**given)

@@ -1,4 +1,4 @@
-"""The recorder on served boards: everything in the file, whatever happens to boards, disk and process."""
+"""The recorder on served boards: all data are in the file, also after faults of boards, disk and process."""
 
 import re
 import signal
@@ -45,13 +45,13 @@ def test_an_arrangement_is_marked_from_beginning_to_end(tmp_path):
         ({"arrangement": "A", "known": "ring"}, "known"),
     ],
 )
-def test_what_cannot_be_known_of_an_arrangement_is_refused(tmp_path, given, named):
+def test_impossible_arrangements_are_refused(tmp_path, given, named):
     with pytest.raises(PlanError, match=named):
         record_bench(tmp_path / "a.uwb", **given)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_plan_that_seats_other_boards_is_refused_before_anything_is_recorded(tmp_path):
+def test_plans_with_other_boards_are_refused_before_recording(tmp_path):
     others, own = (
         RangingPlan(tags=tuple(Tag(number, "drone", (0.1, 0.0, 0.0)) for number in numbers))
         for numbers in ((20, 10), (1,))
@@ -65,14 +65,14 @@ def test_a_plan_that_seats_other_boards_is_refused_before_anything_is_recorded(t
 
 
 @pytest.mark.parametrize("known", ["line 1 1", "plane 1 2", "line 1 b", "line  1"])
-def test_an_order_that_is_none_is_one_line(tmp_path, known):
+def test_wrong_orders_are_one_line(tmp_path, known):
     with Recording.create(tmp_path / "a.uwb", meta={}) as recording:
         recording.append("arrangements", [Arrangement("A", 0, 1, known)])
         with pytest.raises(RecordingError, match="known: found"):
             recording.arrangements()
 
 
-def test_what_the_boards_said_is_in_the_file_and_decodes_to_the_same(tmp_path):
+def test_bytes_of_boards_are_in_the_file_and_decode_to_its_exchanges(tmp_path):
     path, ports = tmp_path / "f.uwb", VirtualPorts(bench_scenario())
     done = record_bench(path, RangingPlan(rate_hz=100.0), ports, duration_s=1.5)
     exchanges, faults, frames, meta = stored(path)
@@ -86,7 +86,7 @@ def test_what_the_boards_said_is_in_the_file_and_decodes_to_the_same(tmp_path):
     for name in ("time_ns", "initiator", "target", "tx1", "rx3", "range_m", "skew2_ppm"):
         order = np.argsort(exchanges.time_ns, kind="stable")
         np.testing.assert_array_equal(getattr(again.exchanges, name), getattr(exchanges, name)[order])
-    # Exchanges come at the rate that was asked for, and their times say so.
+    # Exchanges have the requested rate, and correct times.
     assert np.median(np.diff(np.sort(exchanges.time_ns))) == pytest.approx(1e7, rel=0.1)
 
 
@@ -96,7 +96,7 @@ def test_overheard_exchanges_impulse_responses_and_target_reports(tmp_path):
     done = record_bench(path, plan, ports, duration_s=2.0, passive=True)
     assert not any(board.passive for board in ports.bench.boards.values()), "listening is switched off again"
     with Recording.open(path) as recording:
-        # Each exchange of twenty is reported by both ends and heard by the third, each with its impulse response.
+        # Each of twenty exchanges is reported by both ends and overheard by the third, each with its impulse response.
         assert 19 <= recording.count("overheard") == done.overheard == done.exchanges == done.tried <= 20
         assert recording.count("cirs") == done.cirs == 3 * done.tried
         reporters = set(recording.exchanges().reporter.tolist())
@@ -104,7 +104,7 @@ def test_overheard_exchanges_impulse_responses_and_target_reports(tmp_path):
 
 
 class Unplugging(Listener):
-    """Pulls board 3's cable after 30 turns, and puts it in again after 20 good ones of the others."""
+    """Disconnects board 3 after 30 turns, and connects it again after 20 good turns of the others."""
 
     def __init__(self, server):
         self.server, self.turns, self.others, self.back = server, 0, 0, 0
@@ -136,7 +136,7 @@ def test_an_unplugged_board_leaves_the_others_running_and_resumes(tmp_path):
     assert np.any(again), "passive listening was lost with the power and is restored"
 
 
-def test_a_hanging_board_and_damage_on_the_line_are_faults_and_no_invented_ranges(tmp_path):
+def test_hanging_boards_and_damaged_lines_are_faults_without_wrong_ranges(tmp_path):
     path, counts = tmp_path / "f.uwb", Progress()
     faults = [
         {"kind": "hang", "tag": 3, "at_s": 0.5},
@@ -153,7 +153,7 @@ def test_a_hanging_board_and_damage_on_the_line_are_faults_and_no_invented_range
     exchanges, found, _, _ = stored(path)
     assert {"time-out", "garbage"} <= {fault.kind for fault in found}
     assert len(exchanges) > 25
-    # A damaged line that still decoded would show as a range that its own stamps contradict.
+    # A damaged line that still decodes would be a range that its own stamps contradict.
     assert np.mean(np.abs(raw_range(exchanges) - exchanges.range_m) < 2e-4) > 0.97
 
 
@@ -178,7 +178,7 @@ def command(path, server, *more):
 
 
 def wait_for_rows(path, process):
-    """Wait until a recorder has committed some hundred rows, which takes longer on a busy machine."""
+    """Wait until a recorder has committed some hundred rows, which takes longer under load."""
     log = Path(f"{path}.wal")
     for _ in range(2400):
         if log.exists() and log.stat().st_size > 30_000:
@@ -198,16 +198,16 @@ def test_ctrl_c_ends_cleanly_and_completely(tmp_path):
     assert (process.returncode, "Traceback" in err) == (0, False), err
     count = len(load(path).exchanges)
     good, late = (int((re.search(pattern, out) or [0, 0])[1]) for pattern in (r"(\d+) of ", r"time-out (\d+)"))
-    # On a busy machine a report may come after its time-out: it is stored, and its turn has failed.
+    # Under load, a report may come after its time-out: it is stored, and its turn has failed.
     assert 0 < good <= count <= good + late
     assert not Path(f"{path}.wal").exists()
 
 
 def held_up_s(process):
-    """Return how long the threads of a process waited for a processor so far."""
+    """Return how long the threads of a process have waited for a processor."""
     try:
         texts = [path.read_text() for path in Path(f"/proc/{process.pid}/task").glob("*/schedstat")]
-    except OSError:  # not Linux
+    except OSError:  # other systems than Linux
         return 0.0
     return sum(int(text.split()[1]) for text in texts) * 1e-9
 
@@ -215,7 +215,8 @@ def held_up_s(process):
 @pytest.mark.slow
 def test_kill_9_loses_nothing_older_than_a_quarter_of_a_second(tmp_path):
     path, ages = tmp_path / "f.uwb", []
-    # Besides the processor, the recorder waits for a disk that others use, too: one try in four must keep the promise.
+    # In addition to the processor, the recorder waits for a disk that others use: one try in four must meet the
+    # promise.
     for attempt in range(4):
         with served() as server:
             process = subprocess.Popen(command(path, server), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -228,11 +229,11 @@ def test_kill_9_loses_nothing_older_than_a_quarter_of_a_second(tmp_path):
             process.wait()
         exchanges, _, frames, _ = stored(path)
         assert len(exchanges) > 20
-        # Up to 50 ms pass from one report to the next on three boards, besides the promised 0.25 s.
+        # Up to 50 ms pass between reports on three boards, in addition to the promised 0.25 s.
         ages.append((killed_ns - max(frame.time_ns for frame in frames)) * 1e-9 - others_s)
         if ages[-1] < 0.3:
             return
-        for left in tmp_path.iterdir():  # the log, too, by which the next recorder is waited for
+        for left in tmp_path.iterdir():  # also the log, for which the next recorder waits
             left.unlink()
     raise AssertionError(f"bytes of the last {ages} s were lost")
 
@@ -240,7 +241,7 @@ def test_kill_9_loses_nothing_older_than_a_quarter_of_a_second(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["f.uwb", ".f.uwb.*"])
 def test_a_recorder_that_is_killed_as_it_begins_leaves_a_recording_or_nothing(tmp_path, kind):
-    """Killed at the first sight of the file, and of what is to become it."""
+    """Killed when the file appears, or its temporary file."""
     path = tmp_path / "f.uwb"
     with served() as server:
         process = subprocess.Popen(command(path, server), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -262,7 +263,7 @@ def test_a_full_disk_ends_with_a_clear_line_and_a_readable_file(tmp_path):
     path = tmp_path / "f.uwb"
     with served() as server:
         words = " ".join(command(path, server, "--duration", "30", "--passive", "--cir"))
-        limited = ["bash", "-c", f"ulimit -f 3000; exec {words}"]  # blocks of 1024 bytes that one file may have
+        limited = ["bash", "-c", f"ulimit -f 3000; exec {words}"]  # blocks of 1024 bytes, the limit for one file
         done = subprocess.run(limited, capture_output=True, text=True, timeout=60)
     assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stdout + done.stderr
     assert "cannot be written any more" in done.stderr.splitlines()[-1]

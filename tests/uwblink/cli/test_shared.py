@@ -1,4 +1,4 @@
-"""What the three commands share: errors as one line, statuses, warnings of plug-ins, flags for parameters."""
+"""Functions of the three commands: errors as one line, statuses, warnings of plug-ins, flags for parameters."""
 
 import io
 import os
@@ -25,7 +25,7 @@ class MineError(Exception):
 
 
 class WorseError(MineError):
-    """One with a status of its own."""
+    """An error with its own status."""
 
 
 def run_as_command(work, *errors, **how):
@@ -57,7 +57,7 @@ def test_an_error_is_one_line_and_a_status(error, code, line, capsys):
     assert (end.value.code, capsys.readouterr().err) == (code, line)
 
 
-def test_numbers_beyond_numbers_are_an_error_and_not_a_result(capsys):
+def test_infinite_results_are_errors(capsys):
     def fail() -> None:
         print((np.array([1e300]) * 1e300)[0])
 
@@ -69,7 +69,7 @@ def test_numbers_beyond_numbers_are_an_error_and_not_a_result(capsys):
     assert (end.value.code, out, told) == (2, "", True)
 
 
-def test_an_error_of_nobody_is_not_swallowed():
+def test_unexpected_errors_are_raised():
     def fail() -> None:
         raise ZeroDivisionError
 
@@ -96,7 +96,7 @@ def test_python_m_is_the_command(package):
     assert re.fullmatch(r"Python 3\.[0-9.]+, numpy [0-9.]+, .*duckdb [0-9.]+, .*", beside)
 
 
-def test_the_library_speaks_of_parameters_and_each_has_its_flag():
+def test_parameters_of_the_library_have_flags():
     group = typer.main.get_command(app)
     options = {o for command in group.commands.values() for p in command.params for o in p.opts}  # type: ignore[attr-defined]
     options |= {"--map"}  # of `import csv`
@@ -108,11 +108,11 @@ def test_the_library_speaks_of_parameters_and_each_has_its_flag():
         assert re.findall(r'"[^"\n]*?(?<![-\w])--[a-z][-a-z]+[^"\n]*"', text) == [], path
         named |= set(re.findall(r'"[^"\n]*`([a-z_]+)`', text))
     assert {"force", "offset", "map_file", "tags_from"} <= named
-    # Of columns of tables and keys of maps the descriptions of map keys speak.
+    # Descriptions of map keys name columns of tables and keys of maps.
     assert {shared.with_flags(f"`{name}`") for name in named - {"message", "time_s", "line"}} <= options
 
 
-# What a command does before anything is imported for it.
+# Actions of a command before its imports.
 
 
 THREADS = """
@@ -129,7 +129,7 @@ start(command)
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="on one core linear algebra has one thread anyway")
 @pytest.mark.parametrize(("asked", "threads"), [(None, "1"), ("2", "2")])
-def test_linear_algebra_takes_one_thread_unless_asked_for_more(asked, threads):
+def test_linear_algebra_uses_one_thread_by_default(asked, threads):
     environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
     if asked:
         environment |= {"OPENBLAS_NUM_THREADS": asked, "MKL_NUM_THREADS": asked}
@@ -149,7 +149,7 @@ start(command)
 """
 
 
-def test_a_command_that_is_done_keeps_its_status_when_it_is_interrupted():
+def test_finished_commands_keep_their_status_when_interrupted():
     done = subprocess.run([sys.executable, "-c", INTERRUPTED_AT_THE_END], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -214,7 +214,7 @@ run(app, arguments=[])
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
 
 
-# The line that a command shows while it works.
+# The progress line of a command.
 
 
 class Terminal(io.StringIO):
@@ -222,7 +222,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_on_a_terminal_it_shows_text_and_share_and_goes(monkeypatch):
+def test_progress_on_a_terminal_is_shown_and_removed(monkeypatch):
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
     with waiting("fitting [1]") as update:
@@ -235,7 +235,7 @@ def test_on_a_terminal_it_shows_text_and_share_and_goes(monkeypatch):
     assert screen.getvalue().endswith("\x1b[2K")
 
 
-def test_elsewhere_it_shows_nothing(capsys):
+def test_progress_is_not_shown_elsewhere(capsys):
     with waiting("fitting") as update:
         update(0.5)
     assert capsys.readouterr() == ("", "")

@@ -1,4 +1,4 @@
-"""What leaves the project: every column of every table comes back, and other readers read it."""
+"""Exports: every column of every table is imported again unchanged, and other programs read the files."""
 
 import json
 from typing import Any
@@ -23,7 +23,7 @@ from uwblink.recording.schema import TABLES, Fault, Poses, Tag
 
 @pytest.fixture(scope="module")
 def whole(full):  # noqa: F811
-    """A recording with rows in every table, and without what only a stranger's hand leaves missing."""
+    """A recording with rows in every table, without missing values that only edited files have."""
     with duckdb.connect(str(full)) as db:
         db.execute("DELETE FROM exchanges WHERE tx1 IS NULL")
         db.execute("DELETE FROM cirs WHERE magnitudes IS NULL")
@@ -34,12 +34,12 @@ def whole(full):  # noqa: F811
 
 
 def in_order(path):
-    # Contents are saved in order of time, the exchanges as they are.
+    # Contents are saved in order of time, the exchanges in their own order.
     return {table: found if table == "exchanges" else sorted(found) for table, found in rows(path).items()}
 
 
 @pytest.mark.parametrize("form", [pytest.param("csv", marks=pytest.mark.slow), "parquet"])
-def test_every_column_of_every_table_comes_back(whole, tmp_path, form):
+def test_every_column_of_every_table_is_imported_again(whole, tmp_path, form):
     folder = tmp_path / "it's; DROP TABLE x"
     counts = export_recording(whole, folder, to=form)
     expected = in_order(whole)
@@ -50,7 +50,7 @@ def test_every_column_of_every_table_comes_back(whole, tmp_path, form):
 
 
 def test_trajectories(tmp_path):
-    """Also times of a clock that began elsewhere; the second one lies within a second of zero."""
+    """Also times of a clock with another origin; the second is within a second of zero."""
     time = [1_706_822_508_042_560_815, -1_500_000_000, -250_000_000, 750_000_000]
     poses = Poses.from_arrays(time, ["a/b", "c", "c", "c"], [[1.5, -2.0, 0.1]] * 4, [[0.0, 0.0, 0.6, 0.8]] * 4)
     with Recording.create(tmp_path / "r.uwb") as recording:
@@ -61,7 +61,7 @@ def test_trajectories(tmp_path):
     assert [line.split()[0] for line in other.splitlines()] == ["-1.500000000", "-0.250000000", "0.750000000"]
 
 
-def test_what_cannot_be_exported_leaves_nothing(whole, tmp_path):
+def test_failed_exports_leave_no_files(whole, tmp_path):
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "mine").write_text("mine")
     before = sorted(tmp_path.rglob("*"))
@@ -90,7 +90,7 @@ def test_a_folder_without_a_name_of_its_own_is_refused_with_an_example(whole, tm
     assert [*tmp_path.rglob("*")] == [tmp_path / "inside"]
 
 
-def test_a_folder_that_is_no_export(whole, tmp_path):
+def test_folders_without_an_export_are_not_replaced(whole, tmp_path):
     with pytest.raises(ImportTableError, match=r"contains no exchanges\.csv"):
         import_recording(tmp_path, tmp_path / "o.uwb", importer="exported")
     export_recording(whole, tmp_path / "out", to="csv")
@@ -106,7 +106,7 @@ def test_a_folder_that_is_no_export(whole, tmp_path):
     assert not (tmp_path / "o.uwb").exists()
 
 
-def test_a_form_of_ones_own(whole, tmp_path):
+def test_registered_exporters_are_used(whole, tmp_path):
     def write(recording, folder):
         (folder / "name.txt").write_text(recording.name)
         return {"name.txt": 1}
@@ -130,7 +130,7 @@ def test_a_link_to_a_recording_is_exported_like_the_recording(tmp_path):
 
 @pytest.fixture
 def flown(tmp_path):
-    """One tag on a body that flies along x, half a metre ahead of it; the second of three distances was measured."""
+    """One tag on a body that moves along x, half a metre ahead of it; the second of three distances was measured."""
     exchanges = Exchanges.from_arrays(
         [1] * 3, [2] * 3, time_ns=[0, 10**9, 10**10], tx1=[0] * 3, rx1=[0] * 3, tx2=[10**8] * 3, rx2=[127_795_200] * 3,
         truth_m=[np.nan, 7.25, np.nan],
@@ -144,11 +144,11 @@ def flown(tmp_path):
 
 
 BY_HAND = [np.hypot(0.5 + 2 * 0.001, 3.0), 7.25]
-"""By a range's middle, 1 ms after its time, the body is at 2 mm; the third exchange is after the last pose."""
+"""At the middle of a range, 1 ms after its time, the body is at 2 mm; the third exchange is after the last pose."""
 
 
 @pytest.mark.parametrize("to", ["csv", pytest.param("parquet", marks=pytest.mark.slow)])
-def test_true_distances_are_those_of_the_poses_where_none_was_measured(flown, tmp_path, to):
+def test_missing_true_distances_are_those_of_the_poses(flown, tmp_path, to):
     export_recording(flown, tmp_path / "out", to=to)
     with duckdb.connect() as db:
         query = f"SELECT truth_m, truth_from FROM read_{to}(?)"
@@ -165,7 +165,7 @@ def test_messages_have_true_distances_by_the_poses(flown, tmp_path):
     assert found.truth_m == pytest.approx([*BY_HAND, np.nan], abs=1e-9, nan_ok=True)
 
 
-# What was exported, read by the readers that others use: mcap, rosbags and pandas.
+# Exports read by common readers: mcap, rosbags and pandas.
 
 
 WHEN = 1_706_822_508_042_560_815
@@ -216,7 +216,7 @@ def test_rosbags_reads_standard_messages(recording, tmp_path):
     found = by_topic["/uwb/range_2_5"]
     expected_ns = sorted(e.time_ns[chosen].tolist())
     assert [(t, kind) for t, kind, _ in found] == [(t, "sensor_msgs/msg/Range") for t in expected_ns]
-    # The message holds floats of 32 bits.
+    # The message has floats of 32 bits.
     expected = e.range_m[chosen][np.argsort(e.time_ns[chosen])]
     assert [m.range for *_, m in found] == pytest.approx(expected.tolist(), rel=1e-6)
     stamp = found[0][2].header.stamp
@@ -277,7 +277,7 @@ def test_every_message_is_there_in_order_of_time(recording, tmp_path):
         ("rosbag2", 5, 1e39, 1.0, r"r\.uwb: /uwb/range_1_2: has a number that is .*too large"),
     ],
 )
-def test_what_messages_cannot_say_is_one_line(tmp_path, to, time_ns, range_m, x, said):
+def test_values_that_do_not_fit_messages_are_an_error_of_one_line(tmp_path, to, time_ns, range_m, x, said):
     sample = Exchanges.from_arrays([1], [2], time_ns=[time_ns], range_m=[range_m], tx1=[0], rx1=[5], tx2=[9], rx2=[30])
     poses = Poses(np.array([9]), np.array(["drone"]), np.array([[x, 1.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))
     Contents(exchanges=sample, poses=poses).save(tmp_path / "r.uwb")
@@ -295,7 +295,7 @@ def test_bags_without_the_extra_are_refused(recording, tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def corrected(tmp_path_factory):
-    """A flight of three tags, before and after a calibration, and what that says of each range."""
+    """A flight of three tags before and after a calibration, and the correction of each range."""
     folder = tmp_path_factory.mktemp("corrected")
     flight = calib.sample_flight()
     Contents(exchanges=flight.exchanges, tags=flight.tags, poses=flight.poses).save(folder / "f.uwb")
@@ -305,13 +305,13 @@ def corrected(tmp_path_factory):
 
 
 @pytest.mark.parametrize("form", ["csv", pytest.param("parquet", marks=pytest.mark.slow)])
-def test_corrected_ranges_leave_with_what_is_known_of_each(corrected, tmp_path, form):
+def test_corrected_ranges_are_exported_with_their_expected_errors(corrected, tmp_path, form):
     folder, exchanges, known, applied = corrected
     calib.apply(folder / "f.uwb", known, tmp_path / "out", to=form)
     frame = {"csv": pd.read_csv, "parquet": pd.read_parquet}[form](tmp_path / "out" / f"corrected.{form}")
     assert frame["time_ns"].tolist() == exchanges.time_ns.tolist()
     for name in ("raw_m", "corrected_m", "sigma_m", "sigma_total_m", "tail_share", "tail_probability", "clamped"):
-        # Pandas before 3 reads floats to 3e-14; that every digit is in the file shows when it comes in again, below.
+        # Pandas before 3 reads floats to 3e-14; the import below shows that all digits are in the file.
         assert frame[name].tolist() == pytest.approx(getattr(applied, name).tolist(), rel=1e-13, abs=0)
     assert frame["clamped"].dtype == frame["outlier"].dtype == bool
     assert frame["outlier"].tolist() == applied.outlier.tolist()

@@ -1,4 +1,4 @@
-"""Bags with topics of ranges: guessed and imported, with nothing but the bag, and what is said of their poses."""
+"""Bags with topics of ranges: guessed and imported without other files, and notes on their poses."""
 
 import json
 import sqlite3
@@ -31,7 +31,7 @@ HEADER, STAMPED = "std_msgs/Header header\n", "uwb_msgs/msg/Stamped"
 
 @pytest.fixture(autouse=True)
 def own_types(monkeypatch):
-    """Two more message types than those of the bags with exchanges."""
+    """Two more message types, in addition to those of bags with exchanges."""
 
     def with_more(kind):
         store = store_of(kind)
@@ -46,20 +46,20 @@ def own_types(monkeypatch):
 
 
 def by_map(tmp_path, bag, text):
-    """What comes in by a map with this text."""
+    """Return the result of an import with a map of this text."""
     (tmp_path / "map.toml").write_text(text)
     return read_source(bag, importer="bag", map_file=tmp_path / "map.toml")
 
 
 def by_guess(tmp_path, bag, asked=()):
-    """What comes in by the guess, with 7 in place of what it asks."""
+    """Return the result of an import by the guess, with 7 as the answer to its questions."""
     guess = guess_map(bag)
     assert (guess.complete, guess.asked) == (True, asked), guess.text
     return by_map(tmp_path, bag, guess.text.replace('= "?"', "= 7"))
 
 
 def ends(found):
-    """Initiator and target of each exchange, by their names where they have any."""
+    """Return initiator and target of each exchange, by their names if they have any."""
     named = found.meta.get("tag_names", {})
     pairs = zip(found.exchanges.initiator.tolist(), found.exchanges.target.tolist(), strict=True)
     return [tuple(named.get(str(tag), tag) for tag in pair) for pair in pairs]
@@ -70,7 +70,9 @@ def when(r):
 
 
 def of_anchor(anchor, make):
-    """Return what yields a message of each planted range to an anchor, by its store and the first fields of headers."""
+    """Return a function that yields a message per planted range to an anchor, given its store and the first header
+    fields.
+    """
 
     def messages(store, first):
         for r in PLANT:
@@ -150,7 +152,7 @@ FORMS = {
 
 
 RARER = ("Range in ROS 1", "Range without a tag", "numbers", "fields, and Range")
-"""Forms of which a sibling is read in every run, here or by another test of this folder."""
+"""Forms whose variants are read in every run, here or by another test of this folder."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in RARER)) for name in FORMS])
@@ -171,7 +173,7 @@ def test_ranges_of_a_bag_come_in_by_its_guess(tmp_path, name):
 
 
 def test_both_ids_in_names_of_topics_may_be_words(tmp_path):
-    """Number 1 of a drone is not number 1 of an anchor; a topic of another form stays out."""
+    """Number 1 of a drone differs from number 1 of an anchor; a topic of another form is left out."""
     pairs = [("drone1", "1"), ("drone2", "1"), ("drone1", "2"), ("drone2", "2")]
     for template, name in (
         ("/{from_id}/range_{to_id}", "/{}/range_anchor{}"),
@@ -184,8 +186,8 @@ def test_both_ids_in_names_of_topics_may_be_words(tmp_path):
         assert ({(one, str(other)[-1]) for one, other in got}, len(got)) == (set(pairs), len(PLANT))
 
 
-def test_one_id_in_names_of_topics_is_the_one_that_is_not_in_the_messages(tmp_path):
-    """Or the one that the names tell; a number of a robot is not one of the anchors in its messages."""
+def test_ids_in_names_of_topics_complete_those_in_messages(tmp_path):
+    """Or the id in the names; an id of a robot differs from an id of the anchors in its messages."""
     topics = {f"/robot{k}/uwb": (MINE, of_anchor(k, as_mine)) for k in range(4)}
     found = by_guess(tmp_path, ros2(tmp_path / "fields", topics))
     assert set(ends(found)) == {(f"robot{k}", k) for k in range(4)}
@@ -209,7 +211,7 @@ NO_TOPIC = r"no topic '/uwb/.*there are /uwb/tag7/b/range_9 \(sensor_msgs"
 
 
 def test_a_template_of_topics_in_a_map(tmp_path):
-    """A place is within a part of a name, and a constant of a topic of its own goes before that of a template."""
+    """A placeholder is a part of a name, and the constant of a topic has priority over that of a template."""
     bag = ros2(tmp_path / "b", RANGES | {"/uwb/tag7/b/range_9": (RANGE, of_anchor(0, as_range))})
     text = '[topics."/uwb/tag{from_id}/range_{to_id}"]\nfpp2 = -80\n[topics."/uwb/tag7/range_2"]\nfpp2 = -90\n'
     e = by_map(tmp_path, bag, text + '[columns]\nrange_m = "range"\n').exchanges
@@ -227,7 +229,7 @@ def test_a_template_of_topics_in_a_map(tmp_path):
 
 @pytest.fixture
 def recorded(tmp_path):
-    """A recording of two pairs with powers, and one body that moves, in the time of a simulation."""
+    """A recording of two pairs with powers, and one moving body, in simulated time."""
     n, random = 60, np.random.default_rng(5)
     tx1, flight = np.arange(n) * 10**7, random.integers(100, 3000, n)
     e = Exchanges.from_arrays(
@@ -263,7 +265,7 @@ GUESS = ("uwblink", "import", "guess")
 
 
 def test_the_commands_end_with_true_distances(tmp_path):
-    """Each command is the one that the command before printed."""
+    """Each command is the one that the previous command printed."""
     ros2(tmp_path / "b", RANGES | HEIGHT | POSES)
     anchors = "".join(f"[[anchors]]\nid = {a}\nposition_m = [{a}, 2, 0]\n" for a in range(4))
     (tmp_path / "TAGS.toml").write_text(f'[[tags]]\nid = 7\nbody = "drone"\nlever_arm_m = [0, 0, 0]\n{anchors}')
@@ -278,7 +280,7 @@ def test_the_commands_end_with_true_distances(tmp_path):
     assert set(load(tmp_path / "b.uwb").poses.body) == {"drone", "anchor0", "anchor1", "anchor2", "anchor3"}
 
 
-def test_without_poses_the_command_says_what_can_be_had(tmp_path):
+def test_without_poses_the_command_prints_possible_commands(tmp_path):
     ros2(tmp_path / "b", RANGES)
     said = processes.succeed(*GUESS, "b", "-o", "map.toml", cwd=tmp_path).stdout
     assert all(words in said for words in ("calib survey", "fit_from_ranges", "constants of pairs need true"))
@@ -311,7 +313,7 @@ TEXTS = ["[" * 100_000, '{"a":' * 700 + "1" + "}" * 700, "[1, 2]", '{"ranges": [
 
 
 @pytest.mark.parametrize("text", TEXTS)
-def test_texts_that_are_no_ranges_are_one_line(tmp_path, text):
+def test_messages_without_ranges_are_one_line(tmp_path, text):
     def texts(store, _):
         return ((START + k * 10**8, store.types[TEXT](text)) for k in range(12))
 
@@ -322,7 +324,7 @@ def test_texts_that_are_no_ranges_are_one_line(tmp_path, text):
         by_map(tmp_path, bag, '[topics."/a/{b"]\n[constants]\nfrom_id = 7\nto_id = 8\nrange_m = 3\n')
 
 
-def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
+def test_without_the_extra_the_error_names_the_package_to_install(tmp_path, monkeypatch):
     bag = ros2(tmp_path / "b", RANGES)
     monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
     with pytest.raises(ImportTableError, match=r"pip install 'uwbcal\[bags\]'"):

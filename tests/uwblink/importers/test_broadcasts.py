@@ -1,4 +1,4 @@
-"""Logs of boards that range by broadcast: made here by clocks of their own, and recorded ones."""
+"""Logs of boards that range by broadcasts: made here with separate clocks, and recorded ones."""
 
 import functools
 import json
@@ -23,9 +23,10 @@ NAMES = [f"0x{tag:04X}" for tag in (0xE621, 0x9042, 0x853C, 0xBB1E)]
 
 
 def printed(receptions, remembered=6):
-    """The lines of a log: every board that hears a broadcast, and its sender, prints it with what its sender heard.
+    """Return the lines of a log: every board that hears a broadcast, and its sender, prints it with the list of its
+    sender.
 
-    `ts` of a listed frame is when the sender of the list received it.
+    `ts` of a listed frame is the time at which the sender of the list received it.
     """
     memory: dict[int, list[dict[str, object]]] = {k: [] for k in range(4)}
     lines, numbers = ["/dev/port1\tTrying to connect..."], dict.fromkeys(range(4), 90)
@@ -40,7 +41,7 @@ def printed(receptions, remembered=6):
         for row in rows:
             heard = {"addr": NAMES[sender], "sn": numbers[sender], "ts": int(receptions.rx[row])}
             memory[int(receptions.listener[row]) - 10].insert(0, heard)
-    lines[40] = lines[40][len(lines[40]) // 2 :]  # a board began in the middle of a line
+    lines[40] = lines[40][len(lines[40]) // 2 :]  # a board started in the middle of a line
     return "\n".join(lines) + "\n"
 
 
@@ -48,7 +49,7 @@ COLUMNS = ("sender", "listener", "tx", "rx")
 
 
 def numbers(found):
-    """The place of each tag's name in the list of names."""
+    """Return the index of each tag's name in the list of names."""
     return {tag.tag: NAMES.index(tag.body) for tag in found.tags}
 
 
@@ -58,7 +59,7 @@ def distances(found):
 
 
 def imported(tmp_path, text, change=lambda whole: whole):
-    """Import the text of a log by its guess, ticks for what it asks, changed."""
+    """Import the text of a log by its guess, with ticks as the answer, after changes."""
     (tmp_path / "a.log").write_text(text)
     whole = guess_map(tmp_path / "a.log").text.replace('"?"', '"ticks"')
     (tmp_path / "m.toml").write_text(change(whole))
@@ -89,7 +90,7 @@ def test_every_reception_comes_from_the_lists_and_exchanges_from_receptions(tmp_
     assert 6 * 900 < len(found.exchanges) < len(found.overheard["time_ns"])
 
 
-def test_numbers_that_begin_anew_are_other_frames(tmp_path):
+def test_restarted_frame_numbers_are_other_frames(tmp_path):
     first, second = broadcasts(rounds=60), broadcasts(rounds=60, slot_s=0.007)
     found = imported(tmp_path, printed(first) + printed(second))
     assert len(found.exchanges) > 6 * 2 * 50
@@ -111,7 +112,7 @@ def test_maps_that_cannot_be_are_refused_with_the_key(tmp_path, change, said):
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """Imports a recorded log by its first number, once; gives the path."""
+    """Import a recorded log by its first number, once; return the path."""
     folder = tmp_path_factory.mktemp("swarm")
     with tarfile.open(shared("swarm_broadcast_logs.tar.xz")) as archive:
         archive.extractall(folder, filter="data")
@@ -127,13 +128,13 @@ def recorded(tmp_path_factory):
 
 
 def by_pair(e):
-    """Rows (k,) of exchanges of each pair."""
+    """Return the rows (k,) of exchanges of each pair."""
     key = np.sort(np.column_stack([e.initiator, e.target]), axis=1)
     return [np.flatnonzero((key == pair).all(axis=1)) for pair in np.unique(key, axis=0)]
 
 
 def test_recorded_boards_give_the_ranges_of_their_description(recorded):
-    """Medians by an independent program (README of the data folder), of stamps of 40 bits over 20 s."""
+    """Medians of a separate program (README of the data folder), from stamps of 40 bits over 20 s."""
     found = load(recorded(90))
     assert len(found.receptions["rx"]) == 1098
     named = {tag.tag: tag.body.removeprefix("0x") for tag in found.tags}
@@ -143,12 +144,12 @@ def test_recorded_boards_give_the_ranges_of_their_description(recorded):
         e = found.exchanges
         ours = e.range_m[np.isin(e.initiator, ends) & np.isin(e.target, ends)]
         assert len(ours) > 80
-        # They are printed to a centimetre; a rate from later frames alone would be off by 5 cm.
+        # They are rounded to a centimetre; a rate from later frames alone would cause 5 cm.
         assert np.median(ours) == pytest.approx(range_m, abs=0.011)
         assert ours.std() < 0.04
 
 
-def test_a_lossy_run_has_no_range_that_its_stamps_do_not_support(recorded):
+def test_lossy_logs_have_no_wrong_ranges(recorded):
     """Seven boards stand still, and one in forty of their stamps is wrong by up to 110 m."""
     e = load(recorded(70)).exchanges
     assert len(e) > 0.96 * 496, "as many as there are with every stamp"
@@ -159,16 +160,16 @@ def test_a_lossy_run_has_no_range_that_its_stamps_do_not_support(recorded):
         assert len(row) > 5
         ranges = raw_range(e)[row]
         assert np.abs(ranges - np.median(ranges)).max() < 0.7
-    # Frames stand in the log 76 ms apart, by all the clocks that stamped two.
+    # Frames in the log are 76 ms apart, by all clocks that stamped two of them.
     assert np.ptp(e.time_ns) * 1e-9 == pytest.approx(28.5, abs=1)
 
 
 @pytest.mark.parametrize("run", [90, pytest.param(110, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("first", [0, 1])
 def test_halves_of_a_run_agree_within_their_intervals(recorded, run, first):
-    """A distance that nobody measured is in the constants of both halves, and cancels.
+    """The constants of both halves contain the unknown distances, which cancel.
 
-    In run 110 a board is warming up: by the rate of later frames alone its pairs would drift by 12 to 19 cm.
+    In run 110 a board warms up: by the rate of later frames alone, its pairs would drift by 12 to 19 cm.
     """
     e = load(recorded(run)).exchanges
     later = e.time_ns >= np.median(e.time_ns)
@@ -181,7 +182,7 @@ def test_halves_of_a_run_agree_within_their_intervals(recorded, run, first):
     fitted = calib.fit(halves[first], calib.FitSettings(constants="pair", delays_only=True, between_m=0.0))
     stage = calib.evaluate(halves[1 - first], fitted.calibration).to_dict()["overall"]
     assert abs(stage["full"]["median_m"]) < 0.02
-    # Of 270 ranges 95 % and four standard errors, which count double, since errors last.
+    # 95 % of 270 ranges with four standard errors, doubled because errors persist.
     assert stage["inside_95"] > 0.89
 
 
@@ -193,7 +194,7 @@ def test_halves_of_a_run_agree_within_their_intervals(recorded, run, first):
         (70, "exchanges"),
     ],
 )
-def test_a_geometry_that_was_made_up_is_refuted(recorded, tmp_path, run, use):
+def test_invented_geometry_is_refused(recorded, tmp_path, run, use):
     shutil.copy(recorded(run), tmp_path / "q.uwb")
     (tmp_path / "grid.toml").write_text(
         "".join(f"[[anchors]]\nid = {k + 1}\nposition_m = [{k % 2}, {k // 2}, 1.0]\n" for k in range(7))

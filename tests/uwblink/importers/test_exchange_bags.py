@@ -1,4 +1,4 @@
-"""Exchanges in bags of ROS 1, ROS 2 and MCAP, of messages that are defined here, by a map of their fields."""
+"""Exchanges in bags of ROS 1, ROS 2 and MCAP, with message types defined here, by a map of their fields."""
 
 import numpy as np
 import pytest
@@ -125,13 +125,13 @@ def test_a_list_of_ranges_in_each_message_of_one_topic_of_several(tmp_path):
         ("each = 3\n", "each: found 3"),
     ],
 )
-def test_what_a_bag_does_not_hold_is_said(tmp_path, text, said):
+def test_missing_topics_and_fields_are_named(tmp_path, text, said):
     (tmp_path / "m.toml").write_text(text)
     with pytest.raises(ImportTableError, match=said):
         read_source(ros2(tmp_path / "b", RANGED), importer="bag", map_file=tmp_path / "m.toml")
 
 
-def test_what_is_no_bag_is_said(tmp_path):
+def test_other_files_than_bags_are_refused(tmp_path):
     (tmp_path / "no.bag").write_bytes(b"nothing")
     (tmp_path / "folder").mkdir()
     (tmp_path / "t.csv").write_text("from_id,to_id,range_m\n1,2,3\n")

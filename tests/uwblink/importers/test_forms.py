@@ -1,6 +1,6 @@
-"""Files as people have them, each made here from its description, guessed, imported, and compared with the plant.
+"""Forms of files, each made here from its description, guessed, imported, and compared with the planted values.
 
-docs/importing.md lists the forms; a row of `FORMS` is a row there.
+docs/importing.md lists the forms; each row of `FORMS` is a row there.
 """
 
 import csv
@@ -28,7 +28,7 @@ HEXADECIMAL = ("1A2B", "0C0D", "9280", "5431")
 
 @dataclass(frozen=True)
 class Range:
-    """A planted range of tag 7: time in seconds, number of the anchor, range and distance in metres, power in dBm."""
+    """A planted range of tag 7: time in seconds, id of the anchor, range and distance in metres, power in dBm."""
 
     time_s: float
     anchor: int
@@ -38,7 +38,7 @@ class Range:
 
 
 def planted(count=40, seed=3):
-    """Ranges to four anchors at each time, in whole millimetres; the distance to each anchor stays."""
+    """Return ranges to four anchors at each time, in whole millimetres; the distance to each anchor is constant."""
     random = np.random.default_rng(seed)
     return [
         Range(10 + k / 4, a, float(np.round(2.0 + a + random.normal(0.15, 0.05), 3)), 2.0 + a, -80.0 - a - k % 8)
@@ -64,7 +64,9 @@ def long_rows():
 
 
 def wide_rows(name, scale=1.0, **more):
-    """A row a round, a column an anchor; `more` are columns of a round by functions of its ranges."""
+    """Return a row per round with a column per anchor; `more` are further columns, by functions of the ranges of a
+    round.
+    """
     return [
         {"t_s": some[0].time_s, "tag": 7}
         | {name.format(r.anchor): round(r.range_m * scale, 6) for r in some}
@@ -74,7 +76,7 @@ def wide_rows(name, scale=1.0, **more):
 
 
 def lines(path, of, noise=()):
-    """A log with a line a round, by a function of its ranges, and lines of other kinds between them."""
+    """Return a log with a line per round, by a function of its ranges, and lines of other kinds between them."""
     text = [line for some in ROUNDS for line in (*noise, of(some))]
     path.write_bytes(b"\r\n".join(line if isinstance(line, bytes) else line.encode() for line in text) + b"\r\n")
     return path
@@ -104,7 +106,7 @@ def les(some):
 
 
 def trek(some, kind="mc"):
-    """The third anchor did not answer in any round: its bit is not set, and an old range stands in its place."""
+    """The third anchor never answers: its bit is not set, and an old range is in its place."""
     hexadecimal = " ".join(f"{round(1000 * r.range_m) if r.anchor != 2 else 0x999:08x}" for r in some)
     return f"{kind} 0b {hexadecimal} 095f c1 00024bed a7:0"
 
@@ -114,7 +116,7 @@ def stamped(some):
 
 
 def monitored(some):
-    """Lines of a serial monitor, each with its time of day."""
+    """Return lines of a serial monitor, each with its time of day."""
     seconds = f"00:00:{some[0].time_s:06.3f}"
     return "\r\n".join(f"{seconds} -> from: {r.anchor} Range: {r.range_m} m RX power: {r.power_dbm} dBm" for r in some)
 
@@ -131,7 +133,7 @@ def json_rows(folder, of):
 
 
 def named_files(folder, unit, scale):
-    """A file an anchor, with its distance in the name; no id and no distance within."""
+    """Write a file per anchor, with its distance in the name; without id and distance inside."""
     for a in range(4):
         rows = [{"t_s": r.time_s, "range_m": r.range_m} for r in PLANT if r.anchor == a]
         table(folder / f"tag7_anchor{a}_{(2 + a) * scale:g}{unit}.csv", rows)
@@ -147,12 +149,12 @@ def parquet(folder):
 
 
 def with_columns(columns):
-    """Return what writes the long table with more columns, by a function of each range."""
+    """Return a function that writes the long table with more columns, by functions of each range."""
     return lambda folder: table(folder / "t.csv", [row | columns(r) for row, r in zip(long_rows(), PLANT, strict=True)])
 
 
 def registers(r):
-    """Amplitudes so that the first path has the planted power at 118 symbols, by the manual's formula."""
+    """Return amplitudes for the planted first-path power at 118 symbols, by the formula of the manual."""
     each = (10 ** ((r.power_dbm + 121.74) / 10) * 118**2 / 3) ** 0.5
     total = 10 ** ((r.power_dbm + 3 + 121.74) / 10) * 118**2 / 2**17
     return dict.fromkeys(("FP_AMPL1", "FP_AMPL2", "FP_AMPL3"), each) | {"RXPACC": 118, "CIR_PWR": total}
@@ -176,7 +178,7 @@ def shuffled():
 
 
 def by_both():
-    """Each range twice, from the log of the tag and, 2 ms later, from that of the anchor."""
+    """Return each range twice, from the log of the tag and, 2 ms later, from that of the anchor."""
     rows = []
     for row in long_rows():
         rows += [row, row | {"tag": row["anchor"], "anchor": 7, "t_s": row["t_s"] + 0.002}]
@@ -189,7 +191,7 @@ def renamed(names, rows=None):
 
 @dataclass(frozen=True)
 class Form:
-    """A form of files: what writes one into a folder, answers to what its guess asks, and what it does not hold."""
+    """A form of files: a function that writes one, answers to the questions of its guess, and data that it lacks."""
 
     write: Callable[[Path], Path]
     answers: Mapping[str, object] = field(default_factory=dict)
@@ -287,7 +289,7 @@ FORMS = {
 
 
 def proposed(source, map_file, answers):
-    """Write the proposed map with the answers in place of "?"; an import asks until they are there."""
+    """Write the proposed map with answers in place of "?"; without answers, an import asks for them."""
     guess = guess_map(source)
     assert (guess.complete, set(guess.asked)) == (True, set(answers)), guess.text
     map_file.write_text(guess.text)
@@ -302,7 +304,7 @@ def proposed(source, map_file, answers):
 
 
 def guessed(tmp_path, source, answers):
-    """Import a source by its guess, and answers to what that asks."""
+    """Import a source by its guess, with answers to its questions."""
     return read_source(source, importer="csv", map_file=proposed(source, tmp_path / "map.toml", answers))
 
 
@@ -317,11 +319,11 @@ RARER = (
     "TREK1000", "powers named `RSSI_fp`", "65535 for no range", "times of flight in ns", "decimal commas",
     "logs of both ends", "ids that are words",
 )  # fmt: skip
-"""Forms of which a sibling is read in every run, here or by another test of this folder: the same kind of file."""
+"""Forms whose variants are read in every run, here or by another test of this folder: the same kind of file."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in RARER)) for name in FORMS])
-def test_a_form_comes_in_by_its_guess(tmp_path, name):
+def test_forms_are_imported_by_their_guess(tmp_path, name):
     form = FORMS[name]
     (tmp_path / "in").mkdir()
     found = guessed(tmp_path, form.write(tmp_path / "in"), form.answers)
@@ -336,7 +338,7 @@ def test_a_form_comes_in_by_its_guess(tmp_path, name):
          r.power_dbm if form.powers else np.nan) for r in expected
     )  # fmt: skip
     assert [row[:2] for row in got] == [row[:2] for row in want]
-    # Powers of registers have the digits of a float; a total power serves where there is none of the first path.
+    # Powers of registers have the precision of a float; a total power replaces a missing first-path power.
     for k, atol in ((2, 6e-4 if "AT" in name else 1e-9), (3, 1e-9), (4, 1e-4)):
         np.testing.assert_allclose([row[k] for row in got], [row[k] for row in want], atol=atol)
     assert {named.get(str(n), str(n)) for n in set(e.initiator.tolist())} == {"7"}
@@ -357,7 +359,7 @@ def imported(tmp_path, text, map_text="", name="t.csv"):
 
 @pytest.mark.parametrize("column", ["gt_range_m", pytest.param("fpp1", marks=pytest.mark.slow), "from_x_m"])
 def test_words_in_a_column_that_is_not_needed_are_named(tmp_path, column):
-    """Half of its cells or more are refused; fewer are counted; empty ones and nan are nothing."""
+    """A column with words in half of its cells or more is refused; fewer are counted; empty ones are missing."""
 
     def text(cells):
         rows = [f"{k},1,2,{3 + k / 7:.3f},{cell}\n" for k, cell in enumerate(cells)]
@@ -376,7 +378,7 @@ def test_words_in_a_column_that_is_not_needed_are_named(tmp_path, column):
 
 
 @pytest.mark.parametrize("value", [0, *(pytest.param(v, marks=pytest.mark.slow) for v in (-1, 65535)), 9999.9])
-def test_a_number_that_often_stands_for_no_range_is_refused_until_the_map_states_it(tmp_path, value):
+def test_frequent_placeholders_of_ranges_are_refused_until_the_map_states_them(tmp_path, value):
     text = LONG + "".join(f"{k},1,2,{value if k % 5 == 0 else 3 + k / 7},\n" for k in range(60))
     with pytest.raises(ImportTableError, match=rf"20.0% of its numbers are {value}.* missing = \[{value}"):
         imported(tmp_path, text)
@@ -440,7 +442,7 @@ def test_powers_that_no_chip_reports_are_refused(tmp_path):
     assert len(imported(tmp_path, text, map_text.replace("dw1000", "other")).exchanges) == 30
 
 
-def test_places_state_their_units(tmp_path):
+def test_positions_have_units(tmp_path):
     text = "".join(f"[{500 * k}] AN {k % 3}: {2000 + 7 * k} mm\n" for k in range(30))
     map_text = 'line = "[{time_ms}] AN {to_id}: {range_mm} mm"\nfrom_name = "tag{from_id}_{gt_range_cm}cm.log"\n'
     found = imported(tmp_path, text, map_text, "tag7_250cm.log").exchanges
@@ -449,14 +451,14 @@ def test_places_state_their_units(tmp_path):
     assert (set(found.initiator), set(found.truth_m)) == ({7}, {2.5})
 
 
-def test_a_table_without_a_header_says_so(tmp_path):
+def test_a_table_without_a_header_is_refused_with_that_reason(tmp_path):
     with pytest.raises(ImportTableError, match=r"its first line is a row.* from_id = 2"):
         imported(tmp_path, "".join(f"{k},1,2,{3 + k / 7:.3f}\n" for k in range(30)))
 
 
 @pytest.mark.parametrize("third", ["initiator", "target"])
 def test_messages_as_words_with_ids_in_names_of_files(tmp_path, third):
-    """A file a pair; rows have POLL, RESP and FINAL (or REPORT), and no ids."""
+    """A file per pair; rows have POLL, RESP and FINAL (or REPORT), and no ids."""
     words = ("POLL", "RESP", "FINAL" if third == "initiator" else "REPORT")
     rows = flights(60, third=third)
     (tmp_path / "in").mkdir()
@@ -479,7 +481,7 @@ def test_a_time_of_flight_without_a_unit_is_asked_for(tmp_path):
 
 
 def test_the_quality_of_secure_training_sequences_is_kept(tmp_path):
-    """By exchange and by message; a fit does not use it."""
+    """By exchange and by message; fits do not use it."""
     rows = [row | {"sts_qual": 60 + k % 5} for k, row in enumerate(long_rows())]
     found = guessed(tmp_path, table(tmp_path / "t.csv", rows), {})
     assert found.quality["sts2"].tolist() == [row["sts_qual"] for row in rows]

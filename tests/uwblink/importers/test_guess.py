@@ -1,4 +1,4 @@
-"""What a table is taken for, and that the map says so in words that work."""
+"""The guess of a table's meaning, and the map that states it and works."""
 
 import re
 
@@ -30,7 +30,7 @@ POLL = ("poll_tx", "poll_rx", "resp_tx", "resp_rx", "final_tx", "final_rx")
 
 
 def guessed(tmp_path, rows, *how):
-    """What comes in from a table of rows by the map that is proposed for it."""
+    """Return the result of an import of a table with the map that is proposed for it."""
     path = write(tmp_path / "t.csv", rows, *how)
     guess = guess_map(path)
     assert guess.complete
@@ -46,7 +46,7 @@ def guessed(tmp_path, rows, *how):
         (dict(zip(HEADER[3:9], (f"{n} [us]" for n in HEADER[3:9]), strict=True)), 1e6 / TICKS_PER_SECOND, "target"),
     ],
 )
-def test_a_guess_reads_the_table_right(tmp_path, names, scale, third):
+def test_guesses_read_tables_correctly(tmp_path, names, scale, third):
     rows = flights(third=third)
     names = names | {"time_s": "timestamp", "from_id": "Tag ID", "to_id": "anchor_id", "fpp1": "fp_power_1"}
     table = [
@@ -95,7 +95,7 @@ def test_the_public_table_of_single_sided_ranges(tmp_path):
         pytest.param("event", ("tx", "rx"), "stamp", marks=pytest.mark.slow),
     ],
 )
-def test_a_row_a_stamp(tmp_path, event, words, clock):
+def test_tables_with_a_row_per_stamp_are_read(tmp_path, event, words, clock):
     rows = flights()
     lines = []
     for row in as_messages(wrapped(rows)):
@@ -120,7 +120,7 @@ def test_a_row_a_stamp(tmp_path, event, words, clock):
         ("gt_robot_{}", "p2{}"),
     ],
 )
-def test_places_beside_ranges(tmp_path, mine, other):
+def test_tables_with_positions_and_ranges_are_read(tmp_path, mine, other):
     def called(form, axis):
         return form.format(axis) if "{}" in form else form.replace("x_", f"{axis}_")
 
@@ -138,15 +138,15 @@ def test_places_beside_ranges(tmp_path, mine, other):
         assert e.range_m - e.truth_m == pytest.approx(0.25)
 
 
-def test_places_of_which_some_are_missing_are_not_used_and_it_is_said(tmp_path):
+def test_incomplete_positions_are_not_used_and_noted(tmp_path):
     places = dict.fromkeys(("tag_x", "tag_y", "tag_z", "anchor_x", "anchor_y"), 1.5)
     rows = [{"t_s": k, "src": 1, "dst": 2, "range_m": 3.25, **places} for k in range(30)]
     assert not len(guessed(tmp_path, rows).poses)
     assert "missing: to_z_m" in (tmp_path / "map.toml").read_text()
 
 
-def test_a_table_without_time_between_the_last_messages_is_guessed_in_peace(tmp_path):
-    """Of which some ranges are infinite; as in commands, a warning of NumPy would be an error."""
+def test_zero_third_intervals_give_no_numpy_warning(tmp_path):
+    """Some ranges are infinite; as in commands, a warning of NumPy would be an error."""
     rows = [row | ({"tx3": row["tx2"]} if k % 2 else {}) for k, row in enumerate(wrapped(flights()))]
     assert "tx3" in guess_map(write(tmp_path / "t.csv", rows, ",")).text
 
@@ -160,7 +160,7 @@ OF_MESSAGES = ("t_s", "src", "dst", *(f"ts_{n}" for n in POLL), "poll_fp_level",
     ("called", "true", "decimal"),
     [(GERMAN, "Referenz [cm]", ","), (AT_DEVICES, "Tape", "."), (OF_MESSAGES, "distance_gt_cm", ".")],
 )
-def test_columns_as_labs_call_them(tmp_path, called, true, decimal):
+def test_common_column_names_are_guessed(tmp_path, called, true, decimal):
     rows = flights()
     names = dict(zip(HEADER, called, strict=True)) | {"truth": true}
     scale = dict.fromkeys(HEADER[3:9], 1e9 / TICKS_PER_SECOND) if "[ns]" in called[3] else {}
@@ -188,14 +188,14 @@ def test_messages_that_are_counted_from_zero(tmp_path, third):
     ("ids", "todo"),
     [({"src": 1, "dst": 2}, "check it"), ({"src": 1}, "set to_id in it"), ({}, "set from_id and to_id")],
 )
-def test_the_command_says_what_to_do_and_how_to_go_on(tmp_path, ids, todo):
+def test_the_command_prints_the_next_steps(tmp_path, ids, todo):
     write(tmp_path / "my log.csv", [{"t_s": k, **ids, "range_m": 3.0} for k in range(30)])
     said = processes.run("uwblink", "import", "guess", "my log.csv", "-o", "map.toml", cwd=tmp_path).stdout
     assert said.startswith(f"map.toml: {todo}")
     assert said.endswith(", then uwblink import csv 'my log.csv' --map map.toml -o 'my log'.uwb\n")
 
 
-def test_words_for_ids_are_told_with_their_numbers(tmp_path):
+def test_words_for_ids_are_noted_with_their_numbers(tmp_path):
     rows = [{"t_s": k, "src": chr(65 + k % 13), "dst": chr(66 + k % 13), "range_m": 3.0} for k in range(60)]
     (note,) = guessed(tmp_path, rows).meta["notes"]
     assert re.fullmatch("14 ids are words or too large, and were numbered: A = 1, B = 2,.*, L = 12 and 2 more", note)
@@ -213,8 +213,8 @@ def test_words_for_ids_are_told_with_their_numbers(tmp_path):
         ("MAC_1", "MAC_2"),
     ],
 )
-def test_ends_that_are_called_alike(tmp_path, ends):
-    """Twelve pairs stay twelve: each end has its own column."""
+def test_equal_names_of_initiators_and_targets_differ(tmp_path, ends):
+    """Twelve pairs remain twelve: each end has its own column."""
     pairs = [(one, two) for one in range(1, 5) for two in range(1, 5) if one != two]
     rows = [{"t_s": k, **dict(zip(ends, pairs[k % 12], strict=True)), "range_m": 3 + k / 7} for k in range(60)]
     guess = guess_map(write(tmp_path / "t.csv", rows))
@@ -232,8 +232,8 @@ def test_ends_that_are_called_alike(tmp_path, ends):
         ({"t_s": 0.5, "src": 1, "dst": 2, "range_m": 3.01, "rssi": 84}, "power", "-dBm"),
     ],
 )
-def test_what_a_table_does_not_tell_is_asked_for(tmp_path, row, asked, answer):
-    """The map as it was guessed imports nothing, and nor does one without the line; one with an answer does."""
+def test_missing_information_is_asked_for(tmp_path, row, asked, answer):
+    """The guessed map imports nothing, nor does one without the line; one with an answer does."""
     rows = [{n: v + k if n in ("t", "range", "t_s") else v for n, v in row.items()} for k in range(40)]
     text = guess_map(write(tmp_path / "t.csv", rows)).text
     assert f'{asked} = "?"' in text
@@ -293,14 +293,14 @@ DRAWN = np.random.default_rng(0).random((60, 4))
     ],
     ids=["nothing", "words", "units", "drawn", "messages", "no ranges", "German"],
 )
-def test_what_is_not_there_is_said_and_nothing_is_made_up(tmp_path, rows, complete, asked, said):
+def test_missing_columns_are_named_and_not_invented(tmp_path, rows, complete, asked, said):
     guess = guess_map(write(tmp_path / "t.csv", rows))
     assert (guess.complete, guess.asked) == (complete, asked)
     assert said in guess.text
 
 
 def test_third_stamps_of_the_initiator_in_exchanged_columns_are_not_those_of_the_target(tmp_path):
-    """They look so, by a clock whose rate follows the range, and every range would be plausible and wrong."""
+    """Exchanged columns look like a clock whose rate follows the range; every range would be plausible and wrong."""
     random = np.random.default_rng(4)
     noisy = [
         {n: v + int(random.integers(-6, 7)) if n in HEADER[3:9] else v for n, v in row.items()}
@@ -308,7 +308,7 @@ def test_third_stamps_of_the_initiator_in_exchanged_columns_are_not_those_of_the
     ]
     exchanged = [row | {"tx3": row["rx3"], "rx3": row["tx3"]} for row in noisy]
     assert "protocol" in guess_map(write(tmp_path / "exchanged.csv", exchanged)).asked
-    # Those of the target, by a clock that is 20 ppm off, and of the initiator in their columns are read as ever.
+    # Stamps of the target, with a clock that is 20 ppm off, and of the initiator in their columns are read as usual.
     skewed = [
         {n: (round(v * (1 + 20e-6)) if n in ("rx1", "tx2", "tx3") else v) for n, v in row.items()}
         for row in flights(120, third="target")
@@ -335,7 +335,7 @@ OWN = {"time_s": "time_s", "at_id": "tag", "from_id": "anchor_a", "to_id": "anch
     ],
 )
 def test_differences_of_arrival_without_stamps_are_read(tmp_path, header, named, units):
-    """Of a table with the columns of the public set UTIL, and of others; what their sign is taken for is said."""
+    """Tables with the columns of the public set UTIL, and others; the assumed sign is stated."""
     cells = {"tag": "9", "anchor_a": "1", "idA": "1", "from_id": "1", "anchor_b": "2", "idB": "2", "to_id": "2"}
     cells |= {"anchor_minus": "1", "anchor_plus": "2"}
     rows = "".join(
@@ -358,7 +358,7 @@ def test_differences_of_arrival_without_stamps_are_read(tmp_path, header, named,
     assert found["difference_m"] == pytest.approx(scale * (1.37 + np.arange(30) / 50), rel=1e-9)
 
 
-def test_a_log_of_the_loco_deck_has_a_column_a_pair(tmp_path):
+def test_logs_of_the_loco_deck_have_a_column_per_pair(tmp_path):
     rows = "".join(f"{10 * k},{0.11 + k / 50:.2f},,{-0.13 - k / 50:.2f}\n" for k in range(30))
     (tmp_path / "d.csv").write_text(f"Timestamp,tdoa.d7-0,tdoa.d0-1,tdoa.d1-2\n{rows}")
     text = guess_map(tmp_path / "d.csv").text
@@ -381,7 +381,7 @@ def test_a_log_of_the_loco_deck_has_a_column_a_pair(tmp_path):
         (lambda row: {n: v for n, v in row.items() if n != "at_id"}, ["'at_id'", "missing"]),
     ],
 )
-def test_differences_that_cannot_be_are_refused(tmp_path, change, naming):
+def test_wrong_differences_are_refused(tmp_path, change, naming):
     row = {"time_s": 0.0, "from_id": 1, "to_id": 2, "at_id": 9}
     rows = [row | {"time_s": k / 100, "difference_m": 1.003 + 0.017 * k} for k in range(40)]
     write(tmp_path / "d.csv", [change(one) for one in rows])

@@ -1,4 +1,4 @@
-"""Tables, maps and plug-ins that go wrong: one line, soon, and nothing left behind."""
+"""Tables, maps and plug-ins with faults: one line, soon, and no files left."""
 
 import gzip
 import json
@@ -45,7 +45,7 @@ HEAD = "time_s,from_id,to_id,range_m\n"
 
 
 def refused(path):
-    """Import a table, which must not work; returns the line that says why."""
+    """Import a table, which must fail; return the line of the error."""
     with pytest.raises(ImportTableError, match=one_line(path.name)) as caught:
         import_recording(path, path.parent / "o.uwb")
     assert len(str(caught.value)) < 3000
@@ -70,12 +70,12 @@ def test_a_line_of_very_many_cells_or_letters_is_named_with_its_row(tmp_path, na
 
 def test_a_map_of_a_line_without_an_end_is_refused_soon(tmp_path):
     (tmp_path / "t.csv").write_text(HEAD + 5_000_000 * "1", encoding="utf-8")
-    # The patterns of logs were searched from each letter to the end of the line, which took minutes.
+    # Patterns of logs were searched from each character to the end of the line, which took minutes.
     processes.refuse("uwblink", "import", "guess", tmp_path / "t.csv", naming=["t.csv: row 2"], timeout=90)
 
 
-def test_a_long_line_takes_no_memory(tmp_path):
-    """256 MB in one line, of which no more than a few lines' worth is ever read."""
+def test_a_long_line_is_not_read_into_memory(tmp_path):
+    """256 MB in one line, of which only a few lines' worth is read."""
     with gzip.open(tmp_path / "t.csv.gz", "wb", compresslevel=1) as file:
         file.write(HEAD.encode())
         for _ in range(256):
@@ -106,7 +106,7 @@ NAMES = [f"c{k}" for k in range(5000)]
     ],
     ids=["columns", "fields", "ends of two letters", "long names"],
 )
-def test_columns_beyond_number_and_lines_without_end(tmp_path, name, text):
+def test_tables_with_too_many_columns_or_too_long_lines_are_refused(tmp_path, name, text):
     (tmp_path / name).write_text(text)
     refused(tmp_path / name)
 
@@ -119,7 +119,7 @@ def test_a_table_of_unknown_columns_is_guessed_with_a_line_that_names_them(tmp_p
 
 
 class StrangeError(Exception):
-    """An error that only a plug-in knows."""
+    """An error class that only a plug-in has."""
 
 
 def fails(*_):
@@ -146,7 +146,7 @@ def test_a_plug_in_that_fails_is_one_line_with_its_name(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.flux", "t.csv", "t.uwb"]
 
 
-def test_the_file_that_was_given_is_named_and_not_what_a_plug_in_made_of_it(tmp_path):
+def test_errors_name_the_given_file(tmp_path):
     def tables(_sources, _map, folder):
         (folder / "flux.csv").write_text(HEAD)
         return [folder / "flux.csv"], ColumnMap()
@@ -160,8 +160,8 @@ def test_the_file_that_was_given_is_named_and_not_what_a_plug_in_made_of_it(tmp_
         IMPORTERS.remove("flux")
 
 
-def test_an_interrupted_import_leaves_nothing(tmp_path):
-    """Ctrl-C at any time of it: what is there under the name is whole, and nothing stands beside it."""
+def test_an_interrupted_import_of_a_hard_table_leaves_no_file(tmp_path):
+    """Ctrl-C at any time: a file with the name is complete, and there are no other files."""
     source = write(tmp_path / "t.csv", wrapped(flights(300)))
     stages = []
     import_file(source, tmp_path / "o.uwb", watch=lambda what, _: stages.append(what))
@@ -180,7 +180,7 @@ def test_an_interrupted_import_leaves_nothing(tmp_path):
         assert (tmp_path / "o.uwb").read_bytes() == before
 
 
-# A table comes in as a whole or a few rows at a time, and what is in memory does not grow with it.
+# A table is read as a whole or a few rows at a time, with constant memory.
 
 
 def told(contents):
@@ -190,7 +190,7 @@ def told(contents):
 
 
 def lines_of(layout):
-    """Exchanges as rows in any order, some lost and some that nobody can use."""
+    """Return exchanges as rows in random order, some lost and some unusable."""
     plain = wrapped(flights(80))
     if layout == "messages":
         lines = as_messages(plain)
@@ -226,21 +226,21 @@ def test_a_long_table_is_the_same_a_few_rows_at_a_time(tmp_path, monkeypatch, la
 
 
 @pytest.mark.parametrize("layout", ["messages", "stamps", "parts"])
-def test_a_table_without_any_device_says_so(tmp_path, layout):
+def test_a_table_without_any_device_is_refused_with_that_reason(tmp_path, layout):
     lines = [line | {"from_id": "", "message": 1} for line in lines_of(layout)]
     with pytest.raises(ImportTableError, match="row 2, column 'from_id'"):
         read_rows(tmp_path, lines, f'layout = "{layout}"\n[columns]\nsequence = "seq"\n')
 
 
 @pytest.mark.parametrize(("layout", "missing"), [("messages", "tx"), ("stamps", "event")])
-def test_what_a_layout_needs_is_said(tmp_path, layout, missing):
+def test_missing_columns_of_a_layout_are_named(tmp_path, layout, missing):
     lines = [{n: v for n, v in line.items() if n != missing} for line in lines_of(layout)]
     with pytest.raises(ImportTableError, match=f"column '{missing}' is missing"):
         read_rows(tmp_path, lines, f'layout = "{layout}"')
 
 
 class Bag:
-    """Messages as if they were read from a bag, one at a time."""
+    """Messages as from a bag, one at a time."""
 
     kinds: ClassVar = {"/uwb": "uwb"}
 
@@ -262,12 +262,12 @@ class Bag:
     ],
 )
 def test_memory_does_not_grow_with_what_is_read(tmp_path, monkeypatch, form, at_once, grown):
-    """A column of 8 bytes a row that stayed, or the exchanges of a bag, would be so many bytes more."""
+    """A column of 8 bytes per row that stays in memory, or the exchanges of a bag, would exceed the bound."""
     monkeypatch.setattr(staging, "ROWS_PER_BLOCK", at_once)
     text = mapped(tmp_path, 'within_s = 0.1\n[columns]\nsequence = "seq"\n') if form == "messages" else None
     few, many = {"exchanges": (75, 300), "messages": (40, 140), "bag": (42, 92)}[form]
     peaks = []
-    for times in (10, few, many):  # the first is for what is only made once
+    for times in (10, few, many):  # the first one includes objects that are created once
         rows = [row | {"time_s": row["time_s"] + 100 * (k // 60)} for k, row in enumerate(repeated(flights(), times))]
         path = tmp_path / (f"{times}.mcap" if form == "bag" else f"{times}.csv")
         path.touch()

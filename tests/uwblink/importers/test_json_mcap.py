@@ -1,4 +1,4 @@
-"""MCAP files of JSON messages: the project's own, which come in again, and others', written by the library `mcap`."""
+"""MCAP files of JSON messages: exports of the project, which are imported again, and files of the library `mcap`."""
 
 import json
 import struct
@@ -20,7 +20,7 @@ WHEN = 1_706_822_508_042_560_815
 
 @pytest.fixture
 def exported(tmp_path):
-    """A recording of two pairs and two bodies, some values not known, and the folder that it was exported to."""
+    """A recording of two pairs and two bodies with some unknown values, and the folder of its export."""
     rng = np.random.default_rng(3)
     n = 40
     tx1, reply, flight = (rng.integers(low, high, n) for low, high in ((0, 10**9), (10**7, 2 * 10**7), (100, 3000)))
@@ -41,7 +41,7 @@ def exported(tmp_path):
     return held, tmp_path / "out" / "recording.mcap"
 
 
-def test_ranges_come_in_again_without_a_map(exported):
+def test_exported_ranges_are_imported_without_a_map(exported):
     held, path = exported
     found = read_source(path).exchanges
     names = "time_ns initiator target range_m truth_m fpp1_dbm fpp2_dbm skew1_ppm skew2_ppm"
@@ -50,7 +50,7 @@ def test_ranges_come_in_again_without_a_map(exported):
     assert not found.tx1.any()
 
 
-def test_poses_come_in_again(exported):
+def test_exported_poses_are_imported(exported):
     held, path = exported
     found = read_poses(path)
     for name in ("time_ns", "body", "position_m"):
@@ -109,17 +109,17 @@ def posed(x=1.0, sec=1):
         (posed(sec=10**30), "is no foxglove.PoseInFrame"),
     ],
 )
-def test_what_is_no_pose_is_one_line(tmp_path, message, said):
+def test_wrong_poses_are_one_line(tmp_path, message, said):
     path = written(tmp_path / "t.mcap", {"/poses/a": [message]}, "foxglove.PoseInFrame")
     with pytest.raises(ImportTableError, match=said):
         read_poses(path)
 
 
-# Versions of rosbags before 0.11.9 leave a file open that they refuse.
+# Versions of rosbags before 0.11.9 do not close a file that they refuse.
 @pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO.*z.mcap:pytest.PytestUnraisableExceptionWarning")
 def test_cut_broken_and_endless_files_are_one_line(exported, tmp_path):
     data, path = exported[1].read_bytes(), tmp_path / "t.mcap"
-    # A chunk that unpacks to more than memory holds.
+    # A chunk that is larger than the memory when it is unpacked.
     content = struct.pack("<QQQII", 0, 0, 2**40, 0, 4) + b"zstd" + struct.pack("<Q", 0)
     bomb = b"\x89MCAP0\r\n" + struct.pack("<BQ", 0x01, 8) + bytes(8) + struct.pack("<BQ", 0x06, len(content)) + content
     longest = data[: data.index(b"uwbcal") + 6] + struct.pack("<BQ", 0x05, 2**63)

@@ -31,7 +31,7 @@ def antenna(tag):
 
 
 def exchange(random, pair, when) -> tuple[dict[str, int], dict[str, Any]]:
-    """One DS-TWR exchange between clocks of one rate, in whole unwrapped ticks, and the row that MILUV makes of it."""
+    """Return one DS-TWR exchange between clocks of equal rate, in whole unwrapped ticks, and its row in MILUV."""
     first, second = pair
     distance = float(np.linalg.norm(antenna(first) - antenna(second)))
     flight = round(distance / AIR * 1e9 / TICK_NS)
@@ -57,7 +57,7 @@ def write(path, rows):
 
 @pytest.fixture
 def flight(tmp_path):
-    """A folder with two robots and two anchors; returns it, the stamps in order of time, and the passive ones."""
+    """A folder with two robots and two anchors, its stamps in order of time, and the passive ones."""
     random, folder = np.random.default_rng(3), tmp_path / "flight"
     pairs = [(10, 0), (20, 11), (11, 1), (20, 0), (10, 20), (20, 1)]
     made = [exchange(random, pair, 1.0 + k / 8) for k, pair in enumerate(pairs)]
@@ -103,7 +103,7 @@ def truths(e):
     return [np.linalg.norm(antenna(i) - antenna(j)) for i, j in zip(e.initiator, e.target, strict=True)]
 
 
-def test_every_stamp_of_a_flight_comes_back_once(flight, tmp_path):
+def test_every_stamp_of_a_flight_is_imported_once(flight, tmp_path):
     folder, made, own = flight
     found = imported(folder, tmp_path)
     e, heard, meta = found.exchanges, found.overheard, found.meta
@@ -144,7 +144,7 @@ def test_without_files_of_places_the_measured_distance_is_the_truth(flight, tmp_
     assert e.time_ns[0] == 1_000_000_000
 
 
-def test_a_row_with_a_hole_is_a_fault(flight, tmp_path):
+def test_rows_with_missing_cells_are_faults(flight, tmp_path):
     path = flight[0] / "ifo001" / "uwb_range.csv"
     rows = list(csv.DictReader(path.read_text().splitlines()))
     rows[1]["rx2_raw"] = ""
@@ -175,7 +175,7 @@ def test_a_folder_that_cannot_be_used_is_one_line_and_no_file(flight, tmp_path, 
     assert not (tmp_path / "o.uwb").exists()
 
 
-def test_a_constellation_that_is_not_there(flight, tmp_path):
+def test_missing_constellations_are_named(flight, tmp_path):
     for text, said in (('constellation = "7"', "there are 0, 1"), ("constellation = 7", "constellation: found 7")):
         with pytest.raises(ImportTableError, match=said):
             imported(flight[0], tmp_path, text)
@@ -194,7 +194,7 @@ def test_the_real_flight_gives_the_ranges_of_its_boards(real, tmp_path):
     assert (found.counts(), found.meta["anchor_constellation"]) == (counts, "0")
     assert found.meta["doubled_rows"] == {"uwb_range.csv": 123, "uwb_passive.csv": 261, "uwb_cir.csv": 0}
     e = found.exchanges
-    # The boards cut their ranges to 0.1 mm.
+    # The boards round their ranges down to 0.1 mm.
     assert np.abs(raw_range(e) - e.range_m).max() < 2e-4
     measured = {}
     for path in real.glob("*/uwb_range.csv"):

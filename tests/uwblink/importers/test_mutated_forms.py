@@ -1,7 +1,7 @@
-"""Two hundred tables and logs of any form, changed at random: none comes in with wrong ids, units or protocol.
+"""Two hundred tables and logs of all forms with random changes: no import has wrong ids, units or protocol.
 
-A table may be asked about, refused, or come in right. Changed is what files of people differ in: names, order and
-number of columns, units, delimiters, decimal marks, values for no range, missing cells, ids, order of rows.
+An import may ask, refuse, or be right. The changes are those in which files differ: names, order and number of columns,
+units, delimiters, decimal marks, values for no range, missing cells, ids, order of rows.
 """
 
 import json
@@ -98,7 +98,7 @@ STAMPED = (
 
 
 def written(rng, path, rows, value):
-    """Write rows, changed in ways that any table may be; `value` is a column that may have gaps."""
+    """Write rows with changes that any table may have; `value` is a column that may have gaps."""
     if rng.random() < 0.3:
         order = rng.sample(list(rows[0]), len(rows[0]))
         rows = [{key: row[key] for key in order} for row in rows]
@@ -157,7 +157,7 @@ HEXADECIMAL = {"1A2B": 0, "0C0D": 1, "9280": 2, "5431": 3}
 
 
 def wrong(found, of_stamps):
-    """Return what is wrong with a recording; empty if it has what was planted."""
+    """Return the difference of a recording from the planted values; empty if there is none."""
     e, named = found.exchanges, found.meta.get("tag_names", {})
     if of_stamps:
         planted_pairs = {(1, 2), (2, 3), (3, 1)}
@@ -170,7 +170,7 @@ def wrong(found, of_stamps):
     initiators = {named.get(str(n), str(n)) for n in e.initiator.tolist()}
     got = {(a, round(m, 3)) for a, m in zip(numbers, e.range_m.tolist(), strict=True)}
     said = [] if initiators == {"7"} else [f"initiators {sorted(initiators)}"]
-    # AT+RANGE has whole millimetres of centimetres, so that every planted range is exact to one.
+    # AT+RANGE has millimetres as decimals of centimetres, so every planted range is exact to a millimetre.
     near = {(a, round(m + d, 3)) for a, m in KNOWN for d in (-0.001, 0, 0.001)}
     said += [] if got <= near else [f"ranges {sorted(got - near)[:5]}"]
     said += [] if e.time_ns.max() < 2e18 and np.ptp(e.time_ns) < 11e9 else [f"times {e.time_ns[:3]}"]
@@ -181,7 +181,7 @@ MAKERS = (mutated_long, mutated_long, mutated_wide, mutated_wide, mutated_stamps
 
 
 @pytest.mark.parametrize("seeds", [range(10), pytest.param(range(10, 200), marks=pytest.mark.slow)], ids=str)
-def test_no_mutated_file_comes_in_wrong(tmp_path, seeds):
+def test_no_mutated_file_is_imported_wrongly(tmp_path, seeds):
     outcomes = {"asked": 0, "refused": 0, "right": 0}
     for k in seeds:
         rng = random.Random(k)
@@ -201,5 +201,5 @@ def test_no_mutated_file_comes_in_wrong(tmp_path, seeds):
             continue
         assert not wrong(found, maker is mutated_stamps), (k, path.read_bytes()[:300], guess.text)
         outcomes["right"] += 1
-    # Files that people have are mostly understood.
+    # Most of these files are understood.
     assert outcomes["right"] >= len(seeds) // 4, outcomes

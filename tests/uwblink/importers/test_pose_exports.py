@@ -1,4 +1,4 @@
-"""Exports of motion-capture programs, made here from their descriptions: planted poses and distances come out."""
+"""Exports of motion-capture programs, made here from their descriptions, compared with planted poses and distances."""
 
 import json
 from typing import Any
@@ -29,7 +29,7 @@ ARMS = {"drone": (0.1, -0.2, 0.05), "car": (0.0, 0.3, -0.1)}
 
 
 def rows(numbers):
-    """A row a frame: a function's numbers of each body in turn."""
+    """Return a row per frame: the numbers of each body in turn, by a function."""
     return [[x for name in BODIES for x in numbers(name, k)] for k in range(COUNT)]
 
 
@@ -39,7 +39,8 @@ def lines(path, head, table, mark=","):
 
 
 def angles(turned, order):
-    """Angles about x, y and z in degrees, of rotations about the body's own axes in turn, by elements of the matrix.
+    """Return angles about x, y and z in degrees, of successive rotations about the body's own axes, by elements of the
+    matrix.
 
     R = Rx(a) Ry(b) Rz(c) or Rz(c) Ry(b) Rx(a), multiplied by hand.
     """
@@ -58,7 +59,7 @@ def motive(folder, version="1.23", unit="Millimeters", labelled=True, rotation="
     def numbers(name, k):
         place, turned = BODIES[name][0][k] * scale, BODIES[name][1][k]
         written = angles(turned, rotation) if turns == "XYZ" else turned.as_quat()
-        return [*written, *place, 0.001, *place]  # a marker of the body follows
+        return [*written, *place, 0.001, *place]  # followed by a marker of the body
 
     kinds = ["Rotation"] * len(turns) + ["Position"] * 3 + ["Mean Marker Error"] + ["Position"] * 3
     axes = [*turns, *"XYZ", "", *"XYZ"]
@@ -142,7 +143,7 @@ def test_an_export_of_motion_capture_is_read(tmp_path, name):
 
 
 def ranges(times, range_m):
-    """Ranges from tag 1 to tag 2 without stamps."""
+    """Return ranges from tag 1 to tag 2 without stamps."""
     none: Any = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(len(times), np.int64))
     return Exchanges.from_arrays(1, 2, time_ns=np.rint(times * 1e9).astype(np.int64), range_m=range_m, **none)
 
@@ -155,7 +156,7 @@ def truth(path):
 
 
 def recording(path, arms=ARMS):
-    """Save ranges between the two bodies, exact but for 5 cm, in the middle of frames; returns the true distances."""
+    """Save ranges between the two bodies, exact except for 5 cm, in the middle of frames; return the true distances."""
     times = TIMES[5:-5] + 0.005
     places = {
         name: place[5:-5] + 0.005 * (place[1] - place[0]) * RATE
@@ -172,7 +173,7 @@ def recording(path, arms=ARMS):
 def test_exports_give_the_planted_distances(tmp_path, name):
     true = recording(tmp_path / "r.uwb")
     processes.succeed("uwblink", "poses", tmp_path / "r.uwb", "--from", EXPORTS[name](tmp_path))
-    # Between frames poses are interpolated, and one frame is missing.
+    # Between frames, poses are interpolated, and one frame is missing.
     np.testing.assert_allclose(truth(tmp_path / "r.uwb"), true, atol=1e-4)
 
 

@@ -1,4 +1,4 @@
-"""Poses as drivers of motion capture write them: messages, topics, several files, anchors."""
+"""Poses as written by drivers of motion capture: messages, topics, several files, anchors."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ TURNED = [0.0, 0.0, 0.6, 0.8]
 
 
 def bag(path, messages):
-    """Write a ROS 2 bag of (topic, kind, place, frame) at seconds 0, 1, 2."""
+    """Write a ROS 2 bag of (topic, kind, position, frame) at seconds 0, 1, 2."""
     rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="the extra uwbcal[bags] is not installed")
     from rosbags.typesys import Stores, get_typestore
 
@@ -82,7 +82,7 @@ def test_topics_by_body(tmp_path):
 
 @pytest.fixture
 def recording(tmp_path):
-    """Tags 1 on a car, 2 on a drone, 9 an anchor; and a trajectory of each body as the project writes it."""
+    """A recording of tag 1 on a car, 2 on a drone and anchor 9, and a trajectory of each body in our format."""
     ids = np.array([[1, 2], [1, 9], [2, 9]] * 5)
     when = np.arange(15) * 100_000_000
     e = Exchanges.from_arrays(ids[:, 0], ids[:, 1], time_ns=when, tx1=[0] * 15, rx1=5, tx2=1005, rx2=3000)
@@ -96,7 +96,7 @@ def recording(tmp_path):
 
 
 def test_bodies_without_poses_are_named_whether_some_or_no_ranges_have_both_ends(recording, tmp_path):
-    """Of pairs 1-2, 1-9 and 2-9 the car's and the drone's have poses, or none."""
+    """Of the pairs 1-2, 1-9 and 2-9, car and drone have poses, or none."""
     places, files = tmp_path / "places.toml", ["--from", f"car={tmp_path / 'car' / 'car.tum'}"]
     done = processes.run("uwblink", "poses", recording, *files, "--from", f"drone={tmp_path / 'drone' / 'drone.tum'}")
     assert (done.returncode, done.stderr) == (0, "")
@@ -120,7 +120,7 @@ def test_trajectories_of_several_bodies_and_anchors(recording, tmp_path):
     np.testing.assert_allclose(true_m[:2], [4.0, np.hypot(3.0, 0.1)])
 
 
-def test_anchors_that_cannot_be(recording, tmp_path):
+def test_wrong_anchors_are_refused(recording, tmp_path):
     for text, fragment in (
         ("[[anchors]]\nid = 9\n", "anchors[0].position_m"),
         ("[[anchors]]\nid = 9\nposition_m = [1, 2]\n", "three numbers"),

@@ -79,7 +79,7 @@ def test_rows_in_which_motion_capture_lost_a_body_are_left_out(tmp_path, cell):
         ("a.xyz", "", "expected one of"),
     ],
 )
-def test_files_that_hold_no_poses(tmp_path, name, text, fragment):
+def test_files_without_poses_are_refused(tmp_path, name, text, fragment):
     (tmp_path / name).write_text(text)
     with pytest.raises(ImportTableError, match=one_line(fragment)):
         read_poses(tmp_path / name, "drone" if "cells" in fragment else None)
@@ -109,14 +109,14 @@ def copied(flight, tmp_path):
 
 def test_auto_finds_the_offset_from_the_ranges(flight, copied):
     found = add_poses(copied, flight / "p.csv", offset="auto")
-    # A drone at 1 m/s moves 5 mm in 5 ms; 1500 ranges of 10 cm know a shift of that size.
+    # A drone at 1 m/s moves 5 mm in 5 ms; 1500 ranges of 10 cm determine a shift of that size.
     assert found.offset_s == pytest.approx(-3.210, abs=0.015)
     assert found.covered > 0.95 * found.exchanges
     held = uwblink.load(copied)
     assert (len(held.poses), held.meta["poses_offset_s"]) == (found.poses, pytest.approx(found.offset_s))
 
 
-def test_the_command_says_what_it_did_and_refuses_what_cannot_be(flight, copied, tmp_path):
+def test_the_command_prints_its_result_and_refuses_wrong_options(flight, copied, tmp_path):
     said = processes.run("uwblink", "poses", copied, "--from", flight / "p.csv", "--offset", "-3.21").stdout
     assert "1660 of 1660 measurements have a true distance" in said
     done = processes.run("uwblink", "poses", copied, "--from", flight / "p.csv", "--offset", "soon", "--force")
@@ -131,7 +131,7 @@ def test_the_command_says_what_it_did_and_refuses_what_cannot_be(flight, copied,
 
 
 def scaled(path, factor, output):
-    """A table of poses with its positions multiplied."""
+    """Return a table of poses with its positions multiplied."""
     rows = [line.split(",") for line in path.read_text().splitlines()]
     for row in rows[1:]:
         for k in (rows[0].index(name) for name in "xyz"):
@@ -140,7 +140,7 @@ def scaled(path, factor, output):
     return output
 
 
-def test_poses_that_are_there_stay_unless_they_are_to_be_replaced(flight, copied):
+def test_existing_poses_are_replaced_only_with_force(flight, copied):
     for offset, force in (("-3.21", False), ("-3.1", True)):
         add_poses(copied, flight / "p.csv", offset=offset, force=force)
         assert uwblink.load(copied).meta["poses_offset_s"] == pytest.approx(float(offset))
@@ -160,7 +160,7 @@ def test_poses_that_are_there_stay_unless_they_are_to_be_replaced(flight, copied
 def test_poses_in_other_units_are_refused(flight, copied, tmp_path, unit, factor, offset):
     other = scaled(flight / "p.csv", factor, tmp_path / "p.csv")
     before = copied.read_bytes()
-    # The wrong time leaves only what is far beyond all delays to tell the unit by.
+    # With the wrong time, only ratios far from those of any delay show the unit.
     with pytest.raises(ImportTableError, match="p.csv" if offset == "auto" else f"positions are in {unit}"):
         add_poses(copied, other, offset=offset)
     assert copied.read_bytes() == before
@@ -185,7 +185,7 @@ def test_lever_arms_and_ranges_in_other_units_are_refused(flight, copied, tmp_pa
 
 
 def test_boards_that_stand_still_are_not_taken_for_ranges_in_another_unit(tmp_path):
-    # One distance and noise: multiplied by 0.3048 the noise is smaller, and delays could make up for the rest.
+    # One distance and noise: multiplied by 0.3048, the noise is smaller, and delays could compensate the rest.
     count, reply = 200, 20_000_000
     flight = 640 + np.random.default_rng(4).integers(-8, 9, count)
     zero = np.zeros(count, dtype=np.int64)

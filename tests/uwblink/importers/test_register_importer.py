@@ -1,4 +1,4 @@
-"""A kind of file that somebody adds: from Python and from the command line, and what is refused."""
+"""A registered importer: from Python and from the command line, and errors."""
 
 from contextlib import contextmanager
 from dataclasses import replace
@@ -27,7 +27,7 @@ BLANKS = Importer("blanks", (".ranges", ".ranges.txt"), read_blanks, "Import six
 
 @contextmanager
 def registered(**changes):
-    """Register an importer like BLANKS for a while."""
+    """Register an importer like BLANKS, and remove it afterwards."""
     changed = replace(BLANKS, **changes)
     register_importer(changed)
     try:
@@ -43,7 +43,7 @@ def source(tmp_path):
         yield tmp_path / "my.Ranges"
 
 
-def test_python_knows_it_by_suffix_and_by_name(source, tmp_path):
+def test_registered_importers_are_found_by_suffix_and_name(source, tmp_path):
     assert import_recording(source, tmp_path / "a.uwb") == 2
     (tmp_path / "note.txt").write_text("ticks")
     assert import_recording(source, tmp_path / "b.uwb", importer="blanks", map_file=tmp_path / "note.txt") == 2
@@ -64,7 +64,7 @@ def test_without_a_map_there_is_no_option_for_one(tmp_path):
             import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb", importer="plain", map_file=tmp_path / "m")
 
 
-def test_what_cannot_be_imported_says_so(source, tmp_path):
+def test_files_that_cannot_be_imported_are_named(source, tmp_path):
     with pytest.raises(
         ImportTableError,
         match=r"t\.xls: no importer for this kind of file; the known ones are \.csv, \.csv\.gz, .*\.ranges",
@@ -89,7 +89,7 @@ def test_what_cannot_be_imported_says_so(source, tmp_path):
         ({"map_help": 3}, "map_help: found 3, expected a line of text"),
     ],
 )
-def test_rows_that_cannot_work_are_refused(change, expected):
+def test_wrong_importers_are_refused(change, expected):
     with pytest.raises(ArgumentError, match=expected):
         register_importer(replace(BLANKS, **change))
 

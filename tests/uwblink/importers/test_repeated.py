@@ -1,4 +1,4 @@
-"""Exchanges that both devices log, so that they are in a table twice."""
+"""Exchanges that both devices log, so that a table has them twice."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from uwblink.importers.guess import guess_map
 
 
 def test_the_same_stamps_of_the_same_devices_are_one_exchange(tmp_path):
-    """The second log has another host's clock, and its own power; the first row counts."""
+    """The second log has the clock of another host, and its own power; the first row is used."""
     rows = wrapped(flights(317))
     again = [row | {"time_s": row["time_s"] + 0.003, "fpp1": -99.0} for row in rows[:246:2]]
     found = read_rows(tmp_path, sorted([*rows, *again], key=lambda row: row["time_s"]))
@@ -46,7 +46,7 @@ def test_unusable_rows_and_rows_without_stamps_are_no_repetition(tmp_path):
 
 
 def plain(count, every_s, jitter_s, share, seed, quantum=0.01, noise=0.03):
-    """Ranges of three pairs, of which a share is logged a second time by the other device, by its own clock."""
+    """Return ranges of three pairs, a share of which is also logged by the other device, with its own clock."""
     random, rows = np.random.default_rng(seed), []
     for k in range(count):
         one, other = [(1, 2), (2, 3), (3, 1)][k % 3]
@@ -75,7 +75,7 @@ def test_ranges_without_stamps_that_both_devices_logged_are_merged(tmp_path, see
     assert note.startswith(f"{len(rows) - 317} of {len(rows)} ranges repeat")
 
 
-def test_ranges_that_are_repeated_from_the_same_end_are_told_and_kept(tmp_path):
+def test_repeated_ranges_of_one_end_are_noted_and_kept(tmp_path):
     rows = plain(317, 0.05, 0.004, 0.39, 0)
     rows = [
         row | {"from_id": min(row["from_id"], row["to_id"]), "to_id": max(row["from_id"], row["to_id"])} for row in rows
@@ -86,19 +86,19 @@ def test_ranges_that_are_repeated_from_the_same_end_are_told_and_kept(tmp_path):
 
 
 @pytest.mark.parametrize(("quantum", "noise"), [(0.1, 0.03), (0.01, 0.0)])
-def test_ranges_that_are_equal_by_chance_are_not_told(tmp_path, quantum, noise):
+def test_ranges_that_are_equal_by_chance_are_not_noted(tmp_path, quantum, noise):
     assert not read_rows(tmp_path, plain(600, 0.05, 0, 0, 1, quantum, noise)).meta["notes"]
 
 
-# Stamps of devices with and without antenna delays in them, and of protocols that need more than stamps.
+# Stamps of devices with and without programmed antenna delays, and of protocols that need more than stamps.
 
 
 PROGRAMMED = 16_436
-"""Ticks of each direction, as the boards have them; a device without them stamps its transmissions so much earlier."""
+"""Ticks of each direction, as on the boards; a device without them stamps its transmissions earlier by this."""
 
 
 def undelayed(rows, tags=(1, 2, 3), delay=PROGRAMMED):
-    """The same exchanges as devices stamp them into which nothing was programmed: sent early, received late."""
+    """Return the same exchanges as stamped by devices without programmed delays: sent early, received late."""
     found = []
     for row in rows:
         ends = {"i": row["from_id"] in tags, "t": row["to_id"] in tags}
@@ -125,7 +125,7 @@ def test_devices_without_antenna_delays_are_read_beside_true_distances(tmp_path,
     assert len(found.meta["notes"]) == (not said)
 
 
-def test_a_guess_says_that_nothing_was_programmed(tmp_path):
+def test_guesses_state_missing_antenna_delays(tmp_path):
     for rows, ticks in ((undelayed(flights()), 0), (flights(), PROGRAMMED)):
         path = write(tmp_path / "t.csv", with_truth(rows))
         found = read_table(path, mapped(tmp_path, guess_map(path).text))
@@ -140,7 +140,7 @@ def test_one_device_without_antenna_delays(tmp_path):
     assert found.meta["configured_antenna_delay_ticks_by_tag"] == {"2": {"tx": 0, "rx": 0}}
 
 
-def test_what_a_map_says_of_antenna_delays_is_not_overruled(tmp_path):
+def test_antenna_delays_of_a_map_have_priority(tmp_path):
     rows = with_truth(undelayed(flights()))
     with pytest.raises(ImportTableError, match="antenna_delays"):
         read_rows(tmp_path, rows, f"[antenna_delays]\ntx = {PROGRAMMED}\nrx = {PROGRAMMED}\n")

@@ -1,4 +1,4 @@
-"""Tables as people have them: their own writer here, which shares nothing with the importer, and planted values."""
+"""Variants of tables, by a separate writer that shares no code with the importer, with planted values."""
 
 import csv
 import gzip
@@ -23,11 +23,11 @@ HEADER = ["time_s", "from_id", "to_id", "tx1", "rx1", "tx2", "rx2", "tx3", "rx3"
 
 
 BOUNDS = ((200, 3000), (0, 2**41), (0, 2**41), (20_000_000, 40_000_000), (80_000_000, 90_000_000))
-"""Ticks of an exchange: flight, the beginning of each clock, reply, and from the second message to the third."""
+"""Ticks of an exchange: flight, start of each clock, reply, and from the second message to the third."""
 
 
 def flights(count=60, third="target"):
-    """Exchanges between tags 1, 2, 3 as unwrapped ticks of two clocks, and their true distances (whole ticks)."""
+    """Return exchanges between tags 1, 2, 3 as unwrapped ticks of two clocks, and true distances (whole ticks)."""
     random = np.random.default_rng(1)
     rows = []
     for k in range(count):
@@ -44,12 +44,12 @@ def flights(count=60, third="target"):
 
 
 def repeated(rows, times):
-    """The same exchanges many times, each time with all clocks further on: no two have the same stamps."""
+    """Return the same exchanges many times, with all clocks later each time, so that no stamps are equal."""
     return [later(row, k) for k in range(times) for row in rows]
 
 
 def later(row, ticks):
-    """The same exchange when both clocks are further on."""
+    """Return the same exchange with both clocks later."""
     return {n: v + ticks if n in HEADER[3:9] else v for n, v in row.items()}
 
 
@@ -85,11 +85,11 @@ def read_table(source, map_file=None):
 
 
 def read_rows(tmp_path, rows, text=None):
-    """Write rows to a table, and read it by a map with this text."""
+    """Write rows to a table, and read it with a map of this text."""
     return read_table(write(tmp_path / "t.csv", rows), None if text is None else mapped(tmp_path, text))
 
 
-def test_poses_are_told_from_exchanges(tmp_path):
+def test_poses_and_exchanges_are_distinguished(tmp_path):
     rows = [dict.fromkeys(("time_s", "body", "x", "y", "z", "qx", "qy", "qz", "qw"), 1)] * 3
     with pytest.raises(ImportTableError, match="these are poses, which `uwblink poses` adds to"):
         read_rows(tmp_path, rows)
@@ -123,7 +123,7 @@ def test_unwrapped_stamps_in_any_unit(tmp_path, unit, scale):
     rows = flights()
     scaled = [{n: repr(v * scale) if n in HEADER[3:9] else v for n, v in row.items() if n != "truth"} for row in rows]
     found = read_rows(tmp_path, scaled, f"[units]\nstamps = {unit}\n")
-    # The first stamp of a clock is off by what a float of so many seconds holds; what follows it is not.
+    # The first stamp of a clock has the rounding error of a float of so many seconds; the following intervals do not.
     np.testing.assert_allclose(found.exchanges.range_m, [row["truth"] for row in rows], atol=1e-9)
     assert any("unwrapped" in note for note in found.meta["notes"])
 
@@ -144,7 +144,7 @@ def test_the_width_is_found_and_signed_stamps_are_read(tmp_path, bits):
     assert f"stamps are signed, and are taken modulo 2^{bits}" in found.meta["notes"]
 
 
-def test_the_protocol_is_found_where_the_columns_do_not_tell(tmp_path):
+def test_the_protocol_is_found_by_the_stamps(tmp_path):
     rows = flights(third="initiator")
     write(tmp_path / "t.csv", wrapped(rows))
     found = read_table(tmp_path / "t.csv")
@@ -167,9 +167,9 @@ def test_swapped_columns_are_named(tmp_path):
 def test_corrupt_rows_are_faults_with_their_place(tmp_path):
     rows = flights(count=200)
     lines = write(tmp_path / "t.csv", wrapped(rows)).read_text().splitlines()
-    lines[10] = lines[10].replace(",", ",x", 1)  # an id that is none
-    lines[20] = ",".join(lines[20].split(",")[:6])  # a short row
-    lines[30] += ",1,2,3"  # a long one
+    lines[10] = lines[10].replace(",", ",x", 1)  # not an id
+    lines[20] = ",".join(lines[20].split(",")[:6])  # a row with too few cells
+    lines[30] += ",1,2,3"  # a row with too many cells
     lines[40] = lines[40].rsplit(",", 2)[0] + ",,nan"  # powers are optional
     lines[50] = lines[50].replace(f",{rows[49]['rx2'] % 2**32},", ",-5.5,")
     lines.insert(60, "")
@@ -202,11 +202,11 @@ def test_iso_times_names_and_programmed_delays(tmp_path):
     assert found.meta["configured_antenna_delay_ticks_by_tag"] == {"77": {"tx": 64, "rx": 16486}}
     assert (found.meta["tag_names"]["77"], found.exchanges.initiator[0]) == ("AA:1", 77)
     assert {tag.body for tag in found.tags} >= {"AA:1", "AA:2", "AA:3"}
-    # 07:08:10 two hours east of Greenwich; zones are shifts of a time whose fraction DuckDB keeps to microseconds.
+    # 07:08:10 two hours east of Greenwich; DuckDB keeps microseconds, and zones are shifts.
     assert abs(int(found.exchanges.time_ns[0]) - 1714972090_000000000) < 1000
 
 
-def test_headers_that_two_columns_share_and_nobody_uses(tmp_path):
+def test_unused_repeated_headers_are_accepted(tmp_path):
     rows = flights()
     lines = write(tmp_path / "t.csv", wrapped(rows)).read_text().splitlines()
     (tmp_path / "t.csv").write_text(
@@ -217,12 +217,12 @@ def test_headers_that_two_columns_share_and_nobody_uses(tmp_path):
         read_table(tmp_path / "t.csv", mapped(tmp_path, '[columns]\nskew1 = "note"\n'))
 
 
-def test_what_the_device_reported_is_kept_beside_the_stamps(tmp_path):
+def test_reported_ranges_are_kept_with_stamps(tmp_path):
     rows = [{**row, "range_m": "" if k else 7.5} for k, row in enumerate(wrapped(flights()))]
     assert read_rows(tmp_path, rows).exchanges.range_m[:2] == pytest.approx([7.5, flights()[1]["truth"]])
 
 
-def test_no_time_at_all(tmp_path):
+def test_tables_without_times_are_read(tmp_path):
     rows = [{n: v for n, v in row.items() if n != "time_s"} for row in wrapped(flights())]
     found = read_rows(tmp_path, rows)
     assert found.exchanges.time_ns[:3].tolist() == [0, 1_000_000, 2_000_000]
@@ -284,7 +284,7 @@ def as_messages(rows, third="target"):
         *(pytest.param(*one, marks=pytest.mark.slow) for one in (("initiator", ("seq",)), ("target", ("message",)))),
     ],
 )  # fmt: skip
-def test_a_row_a_message(tmp_path, third, without):
+def test_tables_with_a_row_per_message_are_read(tmp_path, third, without):
     rows = flights(third=third)
     lines = [{n: v for n, v in line.items() if n not in without} for line in as_messages(wrapped(rows), third)]
     if "time_s" not in without:
@@ -306,7 +306,7 @@ def test_a_message_that_got_lost_is_a_fault_not_another_exchange(tmp_path):
     assert (len(found.exchanges), [fault.detail.split(",")[0] for fault in found.faults]) == (59, ["row 8"])
 
 
-def test_two_rows_an_exchange(tmp_path):
+def test_tables_with_two_rows_per_exchange_are_read(tmp_path):
     rows, at_target = flights(), dict.fromkeys(("rx1", "tx2", "tx3"), "")
     lines = []
     for k, row in enumerate(wrapped(rows)):
@@ -393,7 +393,7 @@ def test_duckdb_may_open_the_named_file_only(tmp_path):
         ('[columns]\nevil = "tx1"', "columns.evil: unknown key"),
     ],
 )
-def test_maps_that_cannot_be(tmp_path, text, fragment):
+def test_wrong_maps_are_refused(tmp_path, text, fragment):
     write(tmp_path / "t.csv", wrapped(flights()))
     with pytest.raises(ImportTableError, match=one_line(fragment)):
         import_recording(tmp_path / "t.csv", tmp_path / "o.uwb", map_file=mapped(tmp_path, text))
@@ -411,7 +411,7 @@ def test_maps_that_cannot_be(tmp_path, text, fragment):
         ("t.csv", b"\n"),
     ],
 )
-def test_files_that_cannot_be(tmp_path, name, content):
+def test_wrong_files_are_refused(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ImportTableError, match=one_line()):
         read_table(tmp_path / name)
@@ -437,7 +437,7 @@ def test_every_unit_of_times(tmp_path, unit, scale):
     assert found.time_ns.tolist() == [10**10 + k * 250_000_000 for k in range(60)]
 
 
-def test_half_of_the_rows_end_an_import(tmp_path):
+def test_imports_with_half_of_the_rows_faulty_are_refused(tmp_path):
     rows = wrapped(flights())
     assert len(read_rows(tmp_path, [row | {"tx2": ""} for row in rows[:29]] + rows[29:]).exchanges) == 31
     with pytest.raises(ImportTableError, match="row 2"):

@@ -58,7 +58,7 @@ def test_panels_stand_beside_each_other_on_a_page_and_above_each_other_in_a_colu
     assert [axes.get_subplotspec().get_geometry()[:2] for axes in (wide.axes[0], narrow.axes[0])] == [(1, 2), (2, 1)]
 
 
-def test_it_is_drawn_once_for_all_files():
+def test_figures_are_drawn_once_for_all_files():
     calls = []
 
     def draw(width_in):
@@ -83,7 +83,7 @@ def test_colours_of_a_drawing_become_those_of_the_page():
     assert {f"tag {k}" for k in range(12)} <= set(re.findall(r'data-name="([^"]*)"', page))
 
 
-def test_a_page_knows_what_each_panel_shows():
+def test_pages_have_positions_and_axes_of_panels():
     page = inline(picture(two_panels, "svg"), "")
     left, right = json.loads(unescape(re.search("data-panels='([^']*)'", page)[1]))
     assert left["names"] == ["time (s)", "error (cm)"]
@@ -97,7 +97,7 @@ def test_a_page_knows_what_each_panel_shows():
 
 
 @pytest.mark.parametrize("width", [pytest.param(1280, marks=pytest.mark.slow), 390])
-def test_a_page_lies_well(width, tmp_path):
+def test_pages_fit_into_windows(width, tmp_path):
     header = ["pair", *(f"column {k}" for k in range(20))]
     blocks: list[Block] = [
         Picture("two", two_panels, "A caption. " * 12),
@@ -134,7 +134,7 @@ def test_an_image_of_a_notebook_is_the_picture_and_its_text_is_escaped():
     assert 'alt="a &quot;&lt;b&gt;&quot;"' in page
 
 
-def test_cells_of_words_say_what_they_are_where_no_heading_is_above_them():
+def test_cells_of_words_have_their_heading():
     words = table_html(["criterion", "met", "asked for"], [["is it <so>?", "yes", ""]], words=True)
     assert "<td>is it &lt;so&gt;?</td><td data-head='met'>yes</td><td></td>" in words
     assert ">set <code>a&lt;b&gt;</code>, or `</td>" in table_html(["what"], [["set `a<b>`, or `"]])
@@ -221,7 +221,7 @@ def test_the_measure_is_the_published_one(one, two, apart):
 
 @pytest.mark.parametrize("eyes", list(EYES))
 @pytest.mark.parametrize("ground", ["light", "dark"])
-def test_colours_of_a_kind_are_told_apart(eyes, ground):
+def test_colours_of_series_are_distinct(eyes, ground):
     shown = [colour if ground == "light" else DARK[colour] for colour in SERIES]
     seen = [lab(EYES[eyes] @ linear(colour)) for colour in shown]
     apart = {(a, b): ciede2000(seen[a], seen[b]) for a, b in itertools.combinations(range(len(seen)), 2)}
@@ -229,7 +229,7 @@ def test_colours_of_a_kind_are_told_apart(eyes, ground):
 
 
 @pytest.mark.parametrize("ground", ["light", "dark"])
-def test_lines_and_words_of_figures_stand_out(ground):
+def test_lines_and_text_of_figures_have_contrast(ground):
     # The last two must not stand out, and still show.
     asked = dict.fromkeys(SERIES, 3.0) | {INK: 4.5, MUTED: 4.5, GRID: 1.3, PALE: 1.8}
     for colour, least in asked.items():
@@ -237,7 +237,7 @@ def test_lines_and_words_of_figures_stand_out(ground):
 
 
 @pytest.mark.parametrize("ground", ["light", "dark"])
-def test_words_of_pages_stand_out(ground):
+def test_text_of_pages_has_contrast(ground):
     light, dark = CSS[: CSS.index("* {")].split("@media screen and (prefers-color-scheme: dark)")
     colours = dict(re.findall(r"(--[a-z-]+):\s*(#[0-9a-f]{3,6})", light if ground == "light" else dark))
     full = {name: c if len(c) == 7 else "#" + "".join(2 * x for x in c[1:]) for name, c in colours.items()}
@@ -247,7 +247,7 @@ def test_words_of_pages_stand_out(ground):
             assert contrast(full[word], full[under]) >= 4.5, (word, under)
 
 
-def test_many_are_told_apart_by_more_than_colour():
+def test_many_series_differ_also_without_colour():
     found = [look(k) for k in range(40)]
     assert len({(one.colour, one.marker, str(one.dashes)) for one in found}) == 40
     assert len({(one.marker, str(one.dashes)) for one in found[:12]}) == 12, "without any colour"
@@ -318,7 +318,7 @@ def told(tmp_path_factory):
     return json.loads(unescape(found[1]))
 
 
-def test_it_says_the_values_under_the_pointer(told):
+def test_pages_show_values_at_the_pointer(told):
     shown, (x, y) = told["reading"]
     assert (told["before"], shown) == ("none", "block")
     # A step of a reading is a two-hundredth of the axis.
@@ -326,7 +326,7 @@ def test_it_says_the_values_under_the_pointer(told):
     assert float(y.removeprefix("error (cm): ")) == pytest.approx(3, abs=0.05)
 
 
-def test_a_line_that_is_pointed_at_is_named_and_stands_alone(told):
+def test_lines_at_the_pointer_are_named_and_highlighted(told):
     assert told["series"] == ["tag 1", True, [False, True]]
     assert told["away"] == ["none", False], "and nothing of it stays"
 

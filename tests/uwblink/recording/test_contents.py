@@ -1,4 +1,4 @@
-"""A copy holds every row of every table, except what was put in its place."""
+"""A copy has every row of every table, except those that were replaced."""
 
 import duckdb
 import numpy as np
@@ -44,7 +44,7 @@ INSTEAD = {
 
 @pytest.fixture(scope="module")
 def full(tmp_path_factory):
-    """A recording with rows in every table, not in order of time, and missing values where a stranger left them."""
+    """A recording with rows in every table, not in order of time, and with missing values as in edited files."""
     path = tmp_path_factory.mktemp("full") / "full.uwb"
     with Recording.create(path, meta={"seed": 7, "planted": {"a": [1.5]}}) as r:
         r.append_exchanges(random_exchanges())
@@ -78,7 +78,7 @@ def test_arrangements_and_distances_come_back_in_order(full):
 
 def rows(path):
     with duckdb.connect(str(path), read_only=True) as db:
-        # As text, so that NaN is not different from itself.
+        # As text, so that NaN is equal to itself.
         return {
             table: [str(row) for row in db.execute(f"SELECT {', '.join(columns)} FROM {table} {order}").fetchall()]
             for table, columns in TABLES.items()
@@ -98,8 +98,8 @@ def test_a_copy_has_every_row_of_every_table(full, tmp_path, monkeypatch, at_a_t
 
 
 @pytest.mark.parametrize("first", range(4))
-def test_only_what_is_replaced_differs(full, tmp_path, first):
-    """Every fourth table is replaced: each is once, while all but three others stay."""
+def test_only_replaced_tables_differ(full, tmp_path, first):
+    """Every fourth table is replaced: each table is replaced once."""
     instead = {table: INSTEAD[table] for table in list(INSTEAD)[first::4]}
     with Recording.open(full) as source:
         source.copy(tmp_path / "copy.uwb", replacing=instead)
@@ -128,7 +128,7 @@ def test_mistakes_are_one_line_and_leave_nothing(full, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-# A whole recording in memory: everything comes in, parts can be cut out, and everything goes out again.
+# A whole recording in memory: it is read, parts are selected, and it is written again.
 
 
 SECOND = 1_000_000_000
@@ -166,7 +166,7 @@ def test_a_span_of_time_is_cut_out_with_the_poses_that_it_needs():
     assert part.overheard["time_ns"].tolist() == part.exchanges.time_ns.tolist()
     for rows_of in (part.cirs, part.frames, part.faults):
         assert [(row.time_ns - START) / SECOND for row in rows_of] == [3, 4]
-    # From two poses before the span to two beyond it; the mast's only pose says where it always is.
+    # From two poses before the span to two after it; the only pose of the mast is always included.
     drone = part.poses[part.poses.body == "drone"]
     assert ((drone.time_ns - START) / SECOND).tolist() == [1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5]
     assert (part.poses.body.tolist().count("mast"), len(part.tags)) == (1, 3)
@@ -210,6 +210,6 @@ def test_it_prints_itself_on_a_screen():
         ({"pairs": [1, 2]}, "pairs: found .*, expected pairs of initiator and target"),
     ],
 )
-def test_what_cannot_be_selected_says_so(wrong, expected):
+def test_wrong_selections_are_refused(wrong, expected):
     with pytest.raises(ArgumentError, match=expected):
         made().select(**wrong)

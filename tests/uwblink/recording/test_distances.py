@@ -14,7 +14,7 @@ NEGATED = tuple(-q for q in YAW_90)
 @pytest.mark.parametrize(
     ("begin", "end", "stands", "time_ns", "expected"),
     [
-        # At half time body a is at (1, 0, 0), and its arm, turned by 90 degrees, points along y.
+        # At half of the time, body a is at (1, 0, 0), and its arm, rotated by 90 degrees, points along y.
         (((0, 0, 0), YAW_90), ((2, 0, 0), YAW_90), (1, 4, 0), 50, 3.0),
         (((0, 0, 0), YAW_90), ((0, 0, 0), NEGATED), (0, 4, 0), 50, 3.0),
         (((0, 0, 0), LEVEL), ((0, 0, 0), LEVEL), (0, 4, 0), -1, np.nan),
@@ -31,7 +31,7 @@ def test_distances_are_those_of_antennas_on_their_way(begin, end, stands, time_n
 
 
 @pytest.mark.parametrize(("step_m", "stands"), [(0.1, False), (0.0, True)])
-def test_a_body_that_moves_is_nowhere_where_its_poses_have_a_gap(step_m, stands):
+def test_positions_in_gaps_of_poses_are_unknown(step_m, stands):
     seconds = np.r_[0:2:0.1, 5:7:0.1]
     poses = Poses.from_arrays(
         [*(seconds * 1e9).astype(int), 0],

@@ -1,4 +1,4 @@
-"""The recording: what goes in comes out, and what is not a recording says so."""
+"""The recording: data are read as written, and other files are refused."""
 
 import shutil
 import subprocess
@@ -50,7 +50,7 @@ def change(path, *statements):
 
 
 LATER = ("imu", "height", "powers", "quality", "temperature", "receptions", "differences", "corrected")
-"""Tables that files from before them do not have."""
+"""Tables that files of earlier versions lack."""
 
 
 def test_an_existing_file_is_not_replaced_without_force(recording):
@@ -62,7 +62,7 @@ def test_an_existing_file_is_not_replaced_without_force(recording):
     assert len(load(recording).exchanges) == 0
 
 
-def test_a_failed_block_leaves_nothing_behind(tmp_path):
+def test_a_failed_block_leaves_no_file(tmp_path):
     with pytest.raises(RuntimeError, match="midway"), Recording.create(tmp_path / "x.uwb") as r:
         r.append_exchanges(random_exchanges())
         raise RuntimeError("midway")
@@ -91,7 +91,7 @@ def test_a_truncated_recording_is_one_clear_error(recording, tmp_path, share):
     ],
 )
 def test_wrong_tables_and_newer_versions(recording, statement, said):
-    """Tables of `LATER` may be missing, but not in part."""
+    """Tables of `LATER` may be missing, but not some of their columns."""
     change(recording, statement)
     with pytest.raises(RecordingError, match=said):
         Recording.open(recording)
@@ -117,7 +117,7 @@ sys.stdin.read()
 
 
 @pytest.mark.parametrize("held", ["write", "read"])
-def test_a_file_in_use_elsewhere_says_so(recording, held):
+def test_files_in_use_are_named(recording, held):
     words = [sys.executable, "-c", HOLDER, str(recording), held]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "open\n"
@@ -136,14 +136,14 @@ def test_a_damaged_file_with_the_word_lock_in_its_path_is_damaged(recording, tmp
 
 
 @pytest.mark.parametrize(("name", "command"), [("t.csv", "csv"), ("t.csv.gz", "csv"), ("t.MCAP", "bag")])
-@pytest.mark.parametrize("size", [100, 3 * 4096 + 16384])  # odd, and that of a database
-def test_a_table_given_for_a_recording_is_told_how_to_become_one(tmp_path, name, command, size):
+@pytest.mark.parametrize("size", [100, 3 * 4096 + 16384])  # an odd number of bytes, and the size of a database
+def test_errors_for_tables_name_the_import(tmp_path, name, command, size):
     (tmp_path / name).write_bytes(b"a" * size)
     with pytest.raises(RecordingError, match=f"{name}: is not a recording; convert it with `uwblink import {command}`"):
         Recording.open(tmp_path / name)
 
 
-def test_a_recording_that_this_program_is_writing_says_so(tmp_path):
+def test_recordings_that_are_being_written_are_named(tmp_path):
     with (
         Recording.create(tmp_path / "live.uwb", live=True),
         pytest.raises(RecordingError, match="open in this program"),
@@ -172,7 +172,7 @@ def test_a_recording_that_this_program_is_writing_says_so(tmp_path):
         (lambda r: r.append_meta({"bad": {1, 2}}), "meta 'bad': cannot be stored as JSON"),
     ],
 )
-def test_what_does_not_fit_is_one_line_and_leaves_the_rest_of_a_transaction_out(tmp_path, write, expected):
+def test_values_that_do_not_fit_undo_their_transaction(tmp_path, write, expected):
     with Recording.create(tmp_path / "f.uwb", live=True) as r:
         r.append_exchanges(random_exchanges(7))
         with pytest.raises(RecordingError, match=one_line(expected)), r.transaction():

@@ -1,4 +1,4 @@
-"""Files from strangers: what is a program in them is refused before it runs, what is too much before it is read."""
+"""Untrusted files: programs in them are refused before they run, and too large contents before they are read."""
 
 import json
 import shutil
@@ -41,7 +41,7 @@ ENDLESS = (
         (["DROP TABLE meta", f"CREATE VIEW meta AS {HUGE}"], "a view, meta"),
         (["DROP TABLE meta", f"CREATE VIEW meta AS {ENDLESS}"], "a view, meta"),
         (["DROP TABLE poses", "CREATE VIEW poses AS SELECT * FROM exchanges, range(1000000)"], "a view, poses"),
-        # What would stand for the database's own functions, and lie about the rest.
+        # Objects that would replace functions of the database, and give false results.
         (
             ["CREATE MACRO duckdb_views() AS TABLE SELECT 1 WHERE false", "CREATE VIEW a AS SELECT 1"],
             "a macro, duckdb_views",
@@ -72,7 +72,7 @@ ENDLESS = (
     ],
 )
 def test_programs_in_a_file_are_refused_in_one_line(file, statements, named):
-    """Opened for reading, and those of two statements to be updated."""
+    """Files are opened for reading, and those with two statements for updating."""
     change(file, *statements)
     with pytest.raises(RecordingError, match=one_line("stranger.uwb", named)):
         Recording.open(file, update=len(statements) == 2)
@@ -91,7 +91,7 @@ def test_a_trigger_in_a_file_is_refused(file, tmp_path):
         Recording.open(tmp_path / "stranger2.uwb", update=True)
 
 
-def test_a_recording_may_be_called_as_the_database_calls_its_own(file, tmp_path):
+def test_recordings_may_have_names_of_databases(file, tmp_path):
     for name in ("system", "information_schema", "main", 'a"b;--'):
         place = tmp_path / f"{name}.uwb"
         place.write_bytes(file.read_bytes())
@@ -114,7 +114,7 @@ def test_settings_cannot_be_changed_on_any_connection(file, tmp_path):
                     recording._execute(f"SET {setting}")
 
 
-def test_a_writer_writes_nowhere_but_beside_the_recording(tmp_path):
+def test_writers_use_only_the_folder_of_the_recording(tmp_path):
     (tmp_path / "here").mkdir()
     with (
         Recording.create(tmp_path / "here" / "new.uwb", live=True) as recording,
@@ -151,7 +151,7 @@ def test_meta_is_bounded_in_bytes(file):
         ("'{'", "that of x"),
     ],
 )
-def test_meta_that_is_no_json(file, value, expected):
+def test_wrong_json_in_meta_is_refused(file, value, expected):
     change(file, f"INSERT INTO meta VALUES ('x', {value})")
     with pytest.raises(RecordingError, match=expected) as caught:
         Recording.open(file)
@@ -162,14 +162,14 @@ def test_meta_that_is_no_json(file, value, expected):
     ("table", "row"),
     [("tags", "2, NULL, 0, 0, 0"), ("cirs", "9, 1, 1, 2, NULL, NULL"), ("faults", "9, NULL, 'power', '', NULL, 3")],
 )
-def test_rows_with_nothing_in_them(file, table, row):
+def test_rows_with_missing_values_are_refused(file, table, row):
     change(file, f"INSERT INTO {table} VALUES ({row})")
     with Recording.open(file) as recording, pytest.raises(RecordingError, match=f"table {table}: a row with nothing"):
         getattr(recording, table)()
 
 
 @pytest.mark.parametrize("bits", [0, -1, 33, 64, 10**30, True, None, "32", [32], 32.5])
-def test_counters_that_no_chip_has(file, bits):
+def test_wrong_widths_of_stamps_are_refused(file, bits):
     change(file, f"UPDATE meta SET value = '{json.dumps(bits)}' WHERE key = 'timestamp_bits'")
     with (
         Recording.open(file) as recording,
@@ -178,7 +178,7 @@ def test_counters_that_no_chip_has(file, bits):
         recording.exchanges()
 
 
-def test_a_read_that_does_not_end_is_interrupted(file):
+def test_endless_reads_are_interrupted(file):
     recording = Recording.open(file)
     recording._longest_read_s = 0.3
     with pytest.raises(RecordingError, match="took longer than 0 s"):

@@ -1,4 +1,4 @@
-"""A recording in pieces: each row once, in order of time over all tables, whatever the size of the pieces."""
+"""A recording in pieces: each row once, in order of time over all tables, for any size of the pieces."""
 
 from dataclasses import replace
 from functools import partial
@@ -18,7 +18,7 @@ TAGS = [Tag(1, "drone", (0.1, 0.0, 0.0)), Tag(2, "mast", (0.0, 0.0, 2.0)), Tag(3
 
 
 def contents(seed=1):
-    """Rows of all tables that have a time, not in order of it where they need not be."""
+    """Rows of all tables with a time, not in order of time unless that is required."""
     rng = np.random.default_rng(seed)
     pairs = np.array([(1, 2), (2, 3), (3, 1)])[rng.integers(0, 3, COUNT)]
     time = rng.integers(0, SPAN_NS, COUNT)

@@ -1,4 +1,4 @@
-"""A recording can be read by others while it is written: they get everything until now, and leave nothing behind."""
+"""A recording is read by other processes while it is written: they get all committed rows, and leave no files."""
 
 import json
 import os
@@ -27,7 +27,7 @@ with uwblink.Recording.create(sys.argv[1], live=True) as recording:
 
 
 class Reader(uwblink.Listener):
-    """Reads the recording in another process when so many exchanges have been told of, until it has `found` them."""
+    """Reads the recording in another process after some number of exchanges, until it has `found` them."""
 
     def __init__(self, path, at):
         self.path, self.at, self.turns, self.found = path, at, 0, 0
@@ -35,7 +35,7 @@ class Reader(uwblink.Listener):
     def on_turn(self, turn):
         self.turns += turn.report is not None
         if self.turns == self.at:
-            until_s = time.monotonic() + 60.0  # the writer commits every 0.1 s, and on a busy machine later
+            until_s = time.monotonic() + 60.0  # the writer commits every 0.1 s, and later under load
             while self.found != self.at and time.monotonic() < until_s:
                 shown = processes.fork("uwblink", "show", "--json", self.path).stdout
                 self.found = json.loads(shown)["counts"]["exchanges"]
@@ -70,7 +70,7 @@ def test_what_any_writer_has_committed_is_read_and_not_updated(writer):
     assert sorted(p.name for p in writer.parent.iterdir()) == ["f.uwb", "f.uwb.wal"]
 
 
-def test_of_a_log_that_was_copied_while_it_grew_whole_commits_are_read(writer, tmp_path):
+def test_copied_logs_are_read_up_to_the_last_complete_commit(writer, tmp_path):
     copy, log = tmp_path / "copy.uwb", (tmp_path / "f.uwb.wal").read_bytes()
     copy.write_bytes(writer.read_bytes())
     for share in (0.0, 0.1, 0.5, 0.77, 0.999):
@@ -82,7 +82,7 @@ def test_of_a_log_that_was_copied_while_it_grew_whole_commits_are_read(writer, t
 
 
 @pytest.mark.parametrize("changing", [True, False])
-def test_a_copy_that_cannot_be_made_is_an_error_of_the_reader_alone(writer, monkeypatch, changing):
+def test_failed_copies_are_errors_of_the_reader_only(writer, monkeypatch, changing):
     def copy(source, _target):
         if not changing:
             raise OSError(28, "No space left on device")

@@ -1,4 +1,4 @@
-"""What `uwblink show` says of a recording."""
+"""The summary of a recording by `uwblink show`."""
 
 import io
 from dataclasses import replace
@@ -83,7 +83,7 @@ SKEW_PPM = {1: 0.0, 2: 6.0, 3: -2.5}
 
 
 def exchanges(protocol, sign=1.0, carriers=True, warmer_ppm=0.0):
-    """Ranges of 3 m both ways in every pair; a stamp is its true time by its own clock."""
+    """Return ranges of 3 m in both directions in every pair; a stamp is its true time by its own clock."""
     pairs = np.array([(1, 2), (2, 1), (1, 3), (3, 1), (2, 3), (3, 2)] * 20)
     first, second = pairs.T
     begin = 1e-3 * np.arange(len(pairs))
@@ -101,7 +101,7 @@ def exchanges(protocol, sign=1.0, carriers=True, warmer_ppm=0.0):
 
 
 @pytest.mark.parametrize("protocol", ["ds", "ds-alt"])
-def test_both_see_what_was_planted(protocol):
+def test_stamps_and_carriers_give_the_planted_skews(protocol):
     found = {one.pair: one for one in clock_skews(exchanges(protocol))}
     assert sorted(found) == ["1-2", "1-3", "2-3"]
     for pair, planted in {"1-2": 6.0, "1-3": -2.5, "2-3": -8.5}.items():
@@ -113,36 +113,36 @@ def test_both_see_what_was_planted(protocol):
     assert skew_summary(list(found.values())) == "carriers over stamps 1.000, residual 0.00 ppm, same sign"
 
 
-def test_the_other_sign_is_said():
+def test_opposite_signs_are_stated():
     found = clock_skews(exchanges("ds", sign=-1.0))
     assert [one.same_sign for one in found] == [False] * 3
     assert "OTHER SIGN in 3 of 3 pairs" in skew_summary(found)
     assert "OTHER SIGN" in str(found[0])
 
 
-def test_nothing_is_said_of_carriers_that_were_not_read():
+def test_carriers_without_readings_are_left_out():
     (first, *_) = clock_skews(exchanges("ds", carriers=False))
     assert (first.carrier_ppm, first.slope, first.same_sign) == (None, None, None)
     assert str(first) == "pair 1-2: +6.00 ppm by the stamps, drift +0.00, carriers not read"
 
 
-def test_a_clock_that_drifts_is_told_by_its_pairs():
+def test_drifting_clocks_appear_in_their_pairs():
     drifts = [one.drift_ppm for one in clock_skews([exchanges("ds"), exchanges("ds", warmer_ppm=1.5)])]
     assert drifts == pytest.approx([0.0, 1.5, 1.5], abs=0.01)
 
 
-def test_single_sided_exchanges_have_none():
+def test_single_sided_exchanges_have_no_skews():
     e = exchanges("ds")
     columns = {name: getattr(e, name) for name in ("tx1", "rx1", "tx2", "rx2")}
     assert clock_skews(Exchanges.from_arrays(e.initiator, e.target, **columns)) == []
 
 
-# One exchange is one exchange, whoever reported it.
+# An exchange is counted once, whoever reported it.
 
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory):
-    """The same 2.5 seconds of three boards, targets reporting too, and not."""
+    """The same 2.5 seconds of three boards, with and without reports of targets."""
     folder = tmp_path_factory.mktemp("reports")
     for name, target_reports in (("both", True), ("one", False)):
         plan = uwblink.RangingPlan(rate_hz=60.0, target_reports=target_reports)
@@ -164,7 +164,7 @@ def exchanges_of(path):
     return uwblink.load(path).exchanges
 
 
-def test_each_exchange_is_left_once(both):
+def test_each_exchange_is_kept_once(both):
     exchanges = exchanges_of(both / "both.uwb")
     found = single_reports(exchanges)
     count = len(set(zip(exchanges.tx1.tolist(), exchanges.rx2.tolist(), strict=True)))
@@ -176,7 +176,7 @@ def test_each_exchange_is_left_once(both):
     assert single_reports(one).exchanges is one
 
 
-def test_a_target_s_report_stands_where_the_initiator_s_is_missing(both):
+def test_target_reports_replace_missing_initiator_reports(both):
     exchanges = exchanges_of(both / "both.uwb")
     first = np.argmax(exchanges.reporter == exchanges.target)
     twin = (exchanges.tx1 == exchanges.tx1[first]) & (exchanges.reporter == exchanges.initiator)
@@ -186,7 +186,7 @@ def test_a_target_s_report_stands_where_the_initiator_s_is_missing(both):
 
 
 @pytest.mark.parametrize("name", ["range_m", "tx1", "tx2", "rx3", "skew2_ppm"])
-def test_a_difference_is_found_whichever_number_it_is_in(both, name):
+def test_differences_of_reports_are_found_in_all_columns(both, name):
     exchanges = exchanges_of(both / "both.uwb")
     row = np.flatnonzero(exchanges.reporter == exchanges.target)[7]
     column = getattr(exchanges, name).copy()
@@ -238,7 +238,7 @@ def as_target(report, **changes):
 def test_a_recorder_compares_the_two_reports_as_they_come():
     check = ReportCheck()
     told = "boards 1 and 2 report one exchange of 1 with 2 differently: range_m 3.0 and 3.5, rx3 600 and 601"
-    # The report of one that was lost is not compared with that of the next.
+    # The report of a lost exchange is not compared with that of the next one.
     later = RangeReport(2, 3.1, 107, 207, 307, 407, 507, 607, -80.0, -81.0, 1.0, -1.0)
     for board, report, expected in (
         (1, REPORT, None),

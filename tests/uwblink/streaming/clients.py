@@ -1,4 +1,4 @@
-"""Whoever is at the other end of a stream, from plain sockets: nothing here is shared with what sends."""
+"""Receivers of a stream, from plain sockets, which share no code with the senders."""
 
 import base64
 import json
@@ -8,10 +8,10 @@ import struct
 
 
 class FoxgloveClient:
-    """A viewer that speaks WebSocket (RFC 6455) and Foxglove's protocol by the letter."""
+    """A viewer that implements WebSocket (RFC 6455) and the protocol of Foxglove literally."""
 
     def __init__(self, url, name=None, origin=None):
-        """Connect as a page of an `origin` that found the server by a `name`."""
+        """Connect as a page of an `origin` that uses a `name` for the server."""
         host, port = url.removeprefix("ws://").rsplit(":", 1)
         self.socket = socket.create_connection((host.strip("[]"), int(port)), timeout=20)
         key = base64.b64encode(os.urandom(16)).decode()
@@ -41,7 +41,7 @@ class FoxgloveClient:
         return taken
 
     def receive(self):
-        """Return the opcode and payload of the next frame; servers do not mask."""
+        """Return opcode and payload of the next frame; servers do not mask."""
         first, length = self._take(2)
         if length == 126:
             (length,) = struct.unpack(">H", self._take(2))

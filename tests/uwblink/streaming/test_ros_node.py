@@ -1,4 +1,4 @@
-"""The ROS 2 node of docs/boards.md, against a stand-in for rclpy that takes what the real one takes and no more."""
+"""The ROS 2 node of docs/boards.md, with a stand-in for rclpy that accepts only what the real one accepts."""
 
 import re
 import types
@@ -26,7 +26,7 @@ class Header:
 
 
 class Range:
-    """Fields of sensor_msgs/Range of ROS 2 Jazzy; messages take no others."""
+    """Fields of sensor_msgs/Range of ROS 2 Jazzy; no others are accepted."""
 
     NAMES = ("radiation_type", "field_of_view", "min_range", "max_range", "range", "variance")
     __slots__ = ("header", *NAMES)

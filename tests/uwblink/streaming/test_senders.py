@@ -1,4 +1,4 @@
-"""What arrives at the other end: datagrams at a plain socket, messages at a viewer's WebSocket."""
+"""Received data: datagrams at a plain socket, messages at the WebSocket of a viewer."""
 
 import contextlib
 import json
@@ -45,7 +45,7 @@ def ear():
         yield found
 
 
-def test_a_datagram_is_a_range_as_a_plotter_takes_it(ear):
+def test_datagrams_have_the_format_of_plotters(ear):
     with UdpSender(str(ear.getsockname()[1])) as sender:
         sender.send(ONE)
     assert json.loads(ear.recv(65536)) == {
@@ -59,7 +59,7 @@ def test_a_datagram_is_a_range_as_a_plotter_takes_it(ear):
     }  # fmt: skip
 
 
-def test_sending_to_nobody_is_no_error(ear):
+def test_sending_without_receivers_is_no_error(ear):
     port = ear.getsockname()[1]
     ear.close()
     with UdpSender(f"localhost:{port}") as sender:
@@ -67,7 +67,7 @@ def test_sending_to_nobody_is_no_error(ear):
             sender.send(ONE)
 
 
-def test_a_viewer_gets_a_topic_a_pair_with_its_schema():
+def test_viewers_get_a_topic_per_pair_with_schema():
     with FoxgloveServer("0") as server:
         viewer = FoxgloveClient(server.url)
         assert (viewer.status, viewer.text()["op"]) == (101, "serverInfo")
@@ -128,7 +128,7 @@ def gated():
         yield server
 
 
-def test_requests_that_are_none_print_nothing_and_end_nothing(gated, capfd):
+def test_wrong_requests_have_no_effect(gated, capfd):
     port = int(gated.url.rsplit(":", 1)[1])
     for request in (b"", b"\r\n", b"\xff" * 70_000, b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 200 + b"\r\n"):
         with socket.create_connection(("127.0.0.1", port), timeout=20) as client, contextlib.suppress(OSError):
@@ -154,13 +154,13 @@ def test_a_port_without_a_host_is_of_this_computer_alone(address):
             addresses = [line.split()[1].split(":") for line in LISTENING.read_text().splitlines()[1:]]
             mine = [place for place, number in addresses if int(number, 16) == port]
             assert mine == ["0100007F"], "at 127.0.0.1, and nowhere else"
-        # Another address of this computer, which a server at every address would answer.
+        # Another address of this computer, at which a server for all addresses would answer.
         with socket.socket() as other:
             other.settimeout(5)
             assert other.connect_ex(("127.0.0.2", port))
 
 
-def test_a_port_that_is_taken_and_a_missing_extra_are_said(monkeypatch):
+def test_used_ports_and_missing_extras_are_named(monkeypatch):
     with FoxgloveServer("0") as server, pytest.raises(PortError, match="cannot be served there"):
         FoxgloveServer(server.url.removeprefix("ws://"))
     monkeypatch.setitem(sys.modules, "foxglove", None)
@@ -168,8 +168,8 @@ def test_a_port_that_is_taken_and_a_missing_extra_are_said(monkeypatch):
         FoxgloveServer("0")
 
 
-def test_a_range_is_at_somebody_else_s_20_ms_after_its_poll(ear):
-    """By the boards' own time, so that no other work of this machine counts; docs/boards.md has the figures."""
+def test_ranges_arrive_within_20_ms_of_their_poll(ear):
+    """By the time of the boards, so that other load has no effect; docs/boards.md has the figures."""
     ports, late_ms = VirtualPorts(bench_scenario()), []
     with UdpSender(str(ear.getsockname()[1])) as sender:
         for found in uwblink.stream(list(ports.names.values()), duration_s=1.0, using=ports):

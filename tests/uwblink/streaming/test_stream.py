@@ -1,4 +1,4 @@
-"""Streams: what comes out of boards and recordings, in virtual time and in this one."""
+"""Streams from boards and recordings, in virtual time and in real time."""
 
 import doctest
 import json
@@ -36,7 +36,7 @@ def from_boards(ports=None, rate_hz=50.0, pairs="all", **more):
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
-    """A recording of the boards, which nobody changes."""
+    """A recording of the boards, which no test changes."""
     path = tmp_path_factory.mktemp("flown") / "f.uwb"
     flight(path)
     return path
@@ -59,7 +59,7 @@ def calibration(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def of_two(tmp_path_factory):
-    """A calibration that does not know board 3."""
+    """A calibration without board 3."""
     return calibrated(tmp_path_factory.mktemp("stream") / "two.json", (1, 2))
 
 
@@ -84,7 +84,7 @@ def test_ranges_come_one_at_a_time_and_closing_closes_the_ports():
 
 @pytest.mark.parametrize("protocol", [pytest.param("ss", marks=pytest.mark.slow), "ds"])
 def test_ranges_are_corrected_live_and_played_as_apply_corrects_them(tmp_path, calibration, protocol):
-    """The stamps say more than the range that a board prints, which in SS-TWR is a whole number of ticks."""
+    """Stamps have more digits than the range that a board prints, which in SS-TWR is a whole number of ticks."""
     live: list[uwblink.StreamedRange] = []
     printed = flight(tmp_path / "f.uwb", protocol, listeners=[RangeListener(live.append, calibration)]).range_m
     calib.apply(tmp_path / "f.uwb", calib.load_calibration(calibration), tmp_path / "corrected.uwb")
@@ -112,7 +112,7 @@ def test_a_recording_of_another_protocol_and_stamp_size_is_corrected_as_apply_do
     assert [one.corrected_m for one in played] == expected.tolist()
 
 
-def test_a_tag_that_is_not_calibrated_is_told_before_the_first_range(tmp_path, flown, of_two):
+def test_uncalibrated_tags_are_named_before_the_first_range(tmp_path, flown, of_two):
     with pytest.raises(ValueError, match=r"two\.json: no delay of tag 3"):
         uwblink.stream(flown, calibration=of_two)
     with pytest.raises(PlanError, match="no delay of tag 3"):
@@ -126,7 +126,7 @@ def test_a_tag_that_is_not_calibrated_is_told_before_the_first_range(tmp_path, f
     assert all(math.isfinite(one.corrected_m) for one in found)
 
 
-def test_what_a_correction_raises_while_boards_range_is_told_and_what_came_before_is_kept(tmp_path):
+def test_errors_of_corrections_end_streams_and_keep_earlier_ranges(tmp_path):
     def correct(exchanges):
         if exchanges.tx1.any() and next(seen) == 20:
             raise ValueError("the calibration is broken")
@@ -140,7 +140,7 @@ def test_what_a_correction_raises_while_boards_range_is_told_and_what_came_befor
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock that goes on only while somebody sleeps; gives the seconds slept, one number a sleep."""
+    """A clock that advances only during sleeps; yields the durations of the sleeps."""
     slept: list[float] = []
     monkeypatch.setattr(time, "monotonic", lambda: 1000.0 + math.fsum(slept))
     monkeypatch.setattr(time, "sleep", slept.append)
@@ -165,7 +165,7 @@ def test_a_recording_plays_in_its_own_time(flown, clock):
         ({"calibration": "no.json"}, "no.json"),
     ],
 )
-def test_what_cannot_be_is_said_before_the_first_range(flown, more, named):
+def test_wrong_arguments_are_refused_before_the_first_range(flown, more, named):
     with pytest.raises((ArgumentError, PlanError), match=named):
         uwblink.stream(flown, **more)
 
@@ -203,7 +203,7 @@ def test_the_commands_refuse_a_calibration_of_other_boards_and_write_nothing(tmp
     assert not out.exists()
 
 
-def test_a_reader_that_goes_away_ends_the_stream(flown):
+def test_a_stream_ends_if_its_reader_closes_the_pipe(flown):
     words = f"{BIN / 'uwblink'} stream {flown} --speed 20 | head -n 2"
     done = subprocess.run(["bash", "-c", words], capture_output=True, text=True, timeout=120)
     assert (done.stdout.count("\n"), "Traceback" in done.stderr) == (2, False)
@@ -226,14 +226,14 @@ def test_boards_are_streamed_and_recorded_by_the_command_until_the_time_is_over(
         words = ("--rate", "50", "--duration", "1", "-o", tmp_path / "f.uwb")
         done = processes.succeed("uwblink", "stream", *server.names.values(), *words)
     rows = [json.loads(line) for line in done.stdout.splitlines()]
-    # How many there are in a second, boards in virtual time say; here it is a matter of the machine.
+    # The number per second is tested in virtual time; here it depends on the machine.
     assert len(rows) >= 3
     assert {(row["initiator"], row["target"]) for row in rows} == {(1, 2), (1, 3), (2, 3)}
     assert f"{len(rows)} ranges" in done.stderr
     loaded = uwblink.load(tmp_path / "f.uwb")
     recorded = dict(zip(loaded.exchanges.time_ns.tolist(), loaded.exchanges.range_m.tolist(), strict=True))
     streamed = {row["time_ns"]: row["range_m"] for row in rows}
-    # On a machine that is held up, a report that comes after its turn has timed out is in the file alone, with a fault.
+    # Under load, a report that comes after its turn has timed out is only in the file, with a fault.
     too_late = recorded.keys() - streamed.keys()
     assert len(too_late) <= sum(fault.kind == "time-out" for fault in loaded.faults)
     assert streamed == {time_ns: range_m for time_ns, range_m in recorded.items() if time_ns not in too_late}
@@ -266,7 +266,7 @@ def overheard(tmp_path_factory):
 
 
 def difference_of(contents, row, delays_ns):
-    """What a listener knows, corrected for delays alone: the page of numbers of `calib.data.arrivals`."""
+    """Return the difference of a listener, corrected for delays only: the formula in `calib.data.arrivals`."""
     x, h = contents.exchanges, {name: column[row].item() for name, column in contents.overheard.items()}
     (at,) = np.flatnonzero((x.rx1 == h["rx1_n"]) & (x.tx2 == h["tx2_n"]) & (x.initiator == h["initiator"]))
     e = {name: int(getattr(x, name)[at]) for name in ("initiator", "target", "time_ns", *STAMPS)}
@@ -283,7 +283,7 @@ def difference_of(contents, row, delays_ns):
     return (e["time_ns"], e["initiator"], e["target"], h["listener"]), raw, raw + c * delays_ns[e["target"]] - of_range
 
 
-def test_what_boards_overhear_is_streamed_with_the_ranges(overheard, tmp_path):
+def test_overheard_differences_are_streamed_with_ranges(overheard, tmp_path):
     delays_ns = {1: 0.25, 2: 0.0, 3: -0.25}
     path = tmp_path / "flat.json"
     zero, flat = ({"knots": [0.0] * 4 + [9.0] * 4, "coefficients": [v] * 4, "degree": 3} for v in (0.0, 0.05))
@@ -299,11 +299,11 @@ def test_what_boards_overhear_is_streamed_with_the_ranges(overheard, tmp_path):
     for row in range(0, len(others), 9):
         whose, raw, corrected = difference_of(contents, row, delays_ns)
         assert (others[whose].difference_m, others[whose].corrected_m) == pytest.approx((raw, corrected), abs=1e-6)
-        # Five times the variance of a range where the clocks' rate is known without error, more with one from stamps.
+        # Five times the variance of a range if the clock rate has no error, more with a rate from stamps.
         assert others[whose].shared_m == pytest.approx(0.05, rel=1e-6)
         assert others[whose].sigma_m == pytest.approx(5**0.5 * 0.05, rel=0.02)
     assert [one.time_ns for one in found] == sorted(one.time_ns for one in found)
-    # Boards that are streamed give the same as their recording.
+    # Streamed boards give the same as their recording.
     live = list(from_boards(calibration=path, use="receptions", duration_s=2.0))
     assert sorted(map(str, live)) == sorted(map(str, found))
 
@@ -318,7 +318,7 @@ def test_the_command_prints_differences_in_lines_of_their_own(overheard, calibra
 
 
 @pytest.mark.parametrize(("which", "options"), [("flown", "-c {c}"), ("overheard", ""), ("port", "--dialect arduino")])
-def test_what_cannot_stream_differences(request, calibration, which, options):
+def test_streams_that_cannot_have_differences_are_refused(request, calibration, which, options):
     source = which if which == "port" else request.getfixturevalue(which)
     words = ["uwblink", "stream", source, "--use", "receptions", *options.format(c=calibration).split()]
     processes.refuse(*words, naming=["--use"], status=2)

@@ -1,4 +1,4 @@
-"""The codec against captured bytes, and against arbitrary ones."""
+"""The codec with captured bytes, and with arbitrary ones."""
 
 import itertools
 from dataclasses import FrozenInstanceError
@@ -20,7 +20,7 @@ from uwblink.wire.messages import COMMANDS, REPORTS, Message, RangeReport, Skipp
 REPORTED = [data for _, data in transcripts.captured("->host")]
 COMMANDED = [data for _, data in transcripts.captured("<-host")]
 
-# What the boards themselves take to be odd: the codec skips it, counted.
+# Captured bytes that boards themselves do not understand: the codec skips and counts them.
 ODD_COMMANDS = {
     b"C", b"\r", b"~", b"Hello\r", b"c01\r", b"xxC01\r", b"C01\r\n", b"C01|1|2|3\r", b"Comment\r", b"Cxx\r",
     b"C04|maybe\r", b"C05|two|0|0|0\r", b"C05|258|0|0|0\r", b"C05|2|0|0|0|7\r", b"C08|\r", b"C05|2|0|1\r",
@@ -93,13 +93,13 @@ def test_ranges_recomputed_from_every_captured_exchange():
         np.testing.assert_array_equal(board_range(exchanges), exchanges.range_m)
 
 
-def test_a_cir_comes_in_many_pieces():
+def test_a_cir_is_decoded_from_many_pieces():
     cir = m.Cir(1, 2, 747_015, tuple(range(1016)))
     assert encode(cir).startswith(b"S10|1|2|747|15|0|1|2|")
     assert decode(encode(cir), m.REPORTS, [300] * 15) == [cir]
 
 
-def test_after_damage_every_intact_message_comes_back():
+def test_after_damage_every_intact_message_is_decoded():
     whole = next(d for d in REPORTED if d.startswith(b"R05"))
     (expected,) = decode(whole, m.REPORTS)
     for place in range(len(whole)):
@@ -157,7 +157,7 @@ def test_any_bytes_in_any_chunks_are_messages_or_counted_skips(table, data, size
 
 
 @given(st.binary(max_size=92))
-def test_any_broadcast_comes_back(data):
+def test_any_broadcast_is_decoded_as_encoded(data):
     for table, kind in ((m.COMMANDS, m.Broadcast), (m.REPORTS, m.BroadcastReceived)):
         assert decode(encode(kind(data)), table) == [kind(data)]
 
@@ -186,13 +186,13 @@ def test_values_that_do_not_fit_are_refused(message, text):
         encode(message)
 
 
-# Where fields, lines and messages end: the last value that is taken, and the first that is not.
+# Ends of fields, lines and messages: the last accepted value, and the first refused one.
 
 
 REPORT = b"R05|2|3.0550|2334148660|1211574983|1233803316|2356378373|1332123700|2454699099|-87.4977|-87.5239|-3.4971|3.5222\r\n"  # noqa: E501 - as captured
 
 
-def test_a_decoder_says_what_has_begun():
+def test_decoders_state_the_start_of_messages():
     decoder = Decoder(m.REPORTS)
     for data, begun in ((b"", b""), (b"S10|1|2|7", m.Cir.KEY), (b"|x\r\n", b"")):
         decoder.feed(data)
@@ -203,7 +203,7 @@ def test_in_the_middle_of_damage_nothing_has_begun():
     decoder = Decoder(m.REPORTS)
     decoder.feed(b"\xff\xff R05|2|3.0")
     assert decoder.begun == b""
-    # A message taken up in the middle of a line counts once its end is there, and makes the decoder sure again.
+    # A message read from the middle of a line counts when its end has arrived, and ends the state of damage.
     (taken_up,) = understood(decoder.feed(REPORT[9:]))
     assert (taken_up.neighbour, decoder.messages) == (2, 1)
 
@@ -211,7 +211,7 @@ def test_in_the_middle_of_damage_nothing_has_begun():
 @pytest.mark.parametrize(
     ("data", "messages"),
     [
-        # After damage a message without fields waits for the end of a line.
+        # After damage, a message without fields waits for the end of a line.
         (b"\xffR00\r\n", []),
         (b"\xff\r\nR00\r\n", [m.IdleSet()]),
         (b"\xffR01|7\r\n", [m.IdReport(7)]),
@@ -225,11 +225,11 @@ def test_in_the_middle_of_damage_nothing_has_begun():
         (b"R01|07\r\n", []),
     ],
 )
-def test_what_is_understood_of_damage(data, messages):
+def test_damaged_lines_are_decoded_or_skipped(data, messages):
     assert understood(decode(data, m.REPORTS)) == messages
 
 
-def test_a_line_is_waited_for_up_to_8191_bytes():
+def test_lines_may_have_8191_bytes():
     assert LONGEST_LINE == 8192
     decoder = Decoder(m.REPORTS)
     assert (decoder.feed(b"R05|" + b"1" * 8187), decoder.skipped_bytes, decoder.begun) == ([], 0, b"R05")
@@ -281,7 +281,7 @@ def test_texts_and_bytes_have_the_length_of_the_firmware_s_buffers():
 
 def test_numbers_are_printed_below_ten_billion_and_cut():
     assert (write_printed(9_999_999_999.0), write_printed(-0.0)) == (b"9999999999.0000", b"-0.0000")
-    # What lacks more than a millionth of a unit of the last digit lacks that digit.
+    # A value that lacks more than a millionth of a unit of the last digit has the lower digit.
     assert (write_printed(0.99999885e-4), write_printed(0.9999995e-4)) == (b"0.0000", b"0.0001")
 
 
@@ -295,7 +295,7 @@ def test_numbers_are_printed_below_ten_billion_and_cut():
         (BYTES.write, bytes(1001), "1001 bytes, at most 1000"),
     ],
 )
-def test_what_cannot_be_written(write, value, said):
+def test_values_that_cannot_be_written_are_refused(write, value, said):
     with pytest.raises(FrameError, match=said):
         write(value)
 
@@ -334,15 +334,15 @@ def test_powers_beyond_32_bits_are_numbers_all_the_same():
 def test_the_time_of_an_exchange_is_that_of_its_poll():
     line = b"R05|2|3.0000|4294967000|1|2|63897304|4|127794904|-87.0000|-87.0000|0.0000|0.0000\r\n"
     e, _ = columns_of(b"", line)
-    # rx3 - tx1 is 127 795 200 ticks, 2 ms, across the wrap of the counter; the report came at 1 s.
+    # rx3 - tx1 is 127 795 200 ticks, 2 ms, across the wrap of the counter; the report arrived at 1 s.
     assert e.time_ns[0] == 10**9 - 2_000_000
 
 
-# A stream with damaged bytes: every intact message comes through, and nothing is made up.
+# A stream with damaged bytes: every intact message is decoded, and no other.
 
 
 def stream_of(count, rng):
-    """Random reports of the kinds that boards send while ranging."""
+    """Return random reports of the kinds that boards send while ranging."""
 
     def number(scale):
         return round(float(rng.normal(0, scale)), 4)
@@ -371,12 +371,12 @@ def test_one_percent_of_damaged_bytes(seed):
     assert 0.5 < touched.mean() < 0.9
     found = [e for e in decode(damaged.tobytes(), REPORTS, [333] * (len(damaged) // 333)) if isinstance(e, m.Message)]
     intact = [message for message, bad in zip(sent, touched, strict=True) if not bad]
-    # The intact ones appear, all of them, in their order ...
+    # The intact ones are all decoded, in their order ...
     place = -1
     for each in intact:
         place = found.index(each, place + 1)
-    # ... and there are no more messages than places where one was sent: what else decodes is a sent message whose
-    # damage hit digits only, which no decoder can see, for the wire has no checksum.
+    # ... and there are no more messages than were sent: other decoded ones are sent messages with damaged digits only,
+    # which no decoder can detect, because the wire has no checksum.
     assert len(found) <= min(len(sent), len(intact) + 0.5 * touched.sum())
 
 
@@ -387,12 +387,12 @@ def test_random_bytes_make_no_message():
     assert (decoder.messages, decoder.skipped_bytes) == (0, 200_000)
 
 
-# A message that somebody adds: declared once, then written and read like those of the boards.
+# A registered message: declared once, then written and read like those of the boards.
 
 
 @message(b"R42")
 class Weather(Message):
-    """R42: what a board feels."""
+    """R42: weather at a board."""
 
     board: int = wire(ID)
     place: str = wire(TEXT)
@@ -403,7 +403,7 @@ class Weather(Message):
 
 @message(b"C42")
 class GetWeather(Message):
-    """C42: ask for it, above a height."""
+    """C42: ask for the weather above a height."""
 
     height_m: float = wire(RAW_FLOAT)
 
@@ -420,7 +420,7 @@ SAMPLE = Weather(7, "roof", -3.5, b"|\r\nR05|", wet=True)
 LINE = b"R42|7|roof|-3.5000|\x07\x00|\r\nR05||1\r\n"
 
 
-def test_it_is_written_and_read_whole_byte_by_byte_and_among_others():
+def test_registered_messages_are_written_and_read():
     assert (encode(SAMPLE), decode(LINE, REPORTS), decode(LINE, REPORTS, [1] * len(LINE))) == (LINE, [SAMPLE], [SAMPLE])
     assert decode(b"R00\r\n" + LINE + b"R01|5\r\n", REPORTS)[1] == SAMPLE
     assert decode(encode(GetWeather(1.5)), COMMANDS) == [GetWeather(1.5)]
@@ -473,7 +473,7 @@ class Another(Message):
         (SAMPLE, "expected a class made with @message"),
     ],
 )
-def test_what_cannot_be_a_message_is_refused(kind, expected):
+def test_wrong_messages_are_refused(kind, expected):
     with pytest.raises(ArgumentError, match=expected):
         register_message(kind)
     assert REPORTS[b"R05"] is RangeReport

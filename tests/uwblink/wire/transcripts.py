@@ -1,4 +1,4 @@
-"""The captured bytes of tests/golden: what went to the boards, and what came back."""
+"""The captured bytes of tests/golden: sent to the boards, and received from them."""
 
 import ast
 import re

@@ -1,4 +1,4 @@
-"""What boards read and do: C's numbers, floats that are none, and commands that a stranger adds."""
+"""Input and actions of boards: numbers of C, NaN and infinities, and registered commands."""
 
 import math
 import random
@@ -42,7 +42,7 @@ class Voltage(m.Message):
 
 @pytest.fixture
 def voltage():
-    """The new messages as a stranger registers them, taken out again afterwards."""
+    """Register the new messages, and remove them afterwards."""
     m.register_message(GetVoltage)
     m.register_message(Voltage)
     yield
@@ -58,7 +58,7 @@ def test_a_new_command_is_one_message_class_and_one_executor(voltage):
     assert ports.transfers.maxlen == 20_000, "what boards sent long ago is not kept"
 
 
-def test_an_executor_may_take_its_time_and_may_fail(voltage):
+def test_slow_and_failing_executors_are_allowed(voltage):
     def slowly(board, factor, name):
         tries.append(int(board.bench.env.now))
         yield board.bench.env.timeout(3 * NS_PER_MS)
@@ -117,8 +117,8 @@ def test_numbers_are_read_as_c_reads_them(text, number):
         (b"C03|1|" + b"a" * 196 + b"|1|\0\0\0\0|" + b"\x2a\0" + b"x" * 42 + b"\r", [m.DoTests], True),
     ],
 )
-def test_what_boards_take_otherwise_than_the_firmware_is_what_the_page_says(data, kinds, alive):
-    """docs/boards.md says it; the last of them has 255 bytes."""
+def test_differences_from_the_firmware_are_those_on_the_page(data, kinds, alive):
+    """docs/boards.md lists them; the last has 255 bytes."""
     reading = read_commands(data)
     assert ([command.kind for command in reading.commands], reading.alive) == (kinds, alive)
 
@@ -153,12 +153,12 @@ def test_the_last_command_of_a_buffer_keeps_its_values():
         (-0.00001, b"-0.0000"),
     ],
 )
-def test_floats_that_are_none_are_printed_as_the_processor_prints_them(value, printed):
+def test_nan_and_infinity_are_printed_like_the_processor(value, printed):
     assert printed_float(value) == printed
 
 
 @pytest.mark.parametrize("raw", [b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", b"\x00\x00\x80\xff", b"\xff\xff\x7f\x7f"])
-def test_a_number_that_is_none_does_not_stop_the_bench(raw):
+def test_nan_does_not_stop_the_bench(raw):
     ports = uwbsim.VirtualPorts(bench_scenario())
     ports.bench.boards[1].write(b"C03|1|a|1|" + raw + b"|\x01\x00x\r")
     ports.bench.advance(5 * NS_PER_MS)
@@ -166,7 +166,7 @@ def test_a_number_that_is_none_does_not_stop_the_bench(raw):
     assert Board(ports.port(2)).id == 2
 
 
-# No byte from a client ends the bench or another board: six thousand commands, right, wrong and mangled.
+# No byte of a client stops the bench or another board: six thousand commands, correct, wrong and damaged.
 
 
 COMMANDS = 6_000
@@ -176,7 +176,7 @@ RANDOM_SHARE, MANGLED_SHARE, RANGE_SHARE = 0.1, 0.2, 0.03
 
 
 def command(rng):
-    """A command whose fields are of the right kinds, with values that nobody asked for."""
+    """Return a command whose fields have the right types and random values."""
     numbers = [rng.choice(NUMBERS) for _ in range(4)]
     data = rng.randbytes(rng.choice((0, 1, 5, 40, 92, 93, 200)))
     counted = struct.pack("<H", len(data) if rng.random() < 0.9 else rng.randrange(65_536)) + data
@@ -192,7 +192,7 @@ def command(rng):
 
 
 def mangled(rng, data):
-    """The same with bytes replaced, left out, or doubled."""
+    """Return the same with bytes replaced, removed, or doubled."""
     data = bytearray(data)
     for _ in range(rng.randrange(1, 4)):
         at = rng.randrange(len(data))
@@ -222,19 +222,19 @@ def test_no_byte_ends_the_bench_or_another_board():
             assert all(bench.boards[k].alive for k in (2, 3))
     victim.power_cycle()
     assert Board(ports.port(1)).request(m.GetId()) == m.IdReport(1)
-    # Much of this kills a board, as it does a real one, and much is answered: the test reaches both.
+    # Many of these stop a board, as they stop a real one, and many are answered: the test covers both.
     assert deaths > 60
     assert answers > 600
 
 
-# Poses in step with the boards' time, as long as they are served.
+# Poses in the time of the boards, while they are served.
 
 
 EPOCH_NS = 1_700_000_000_000_000_000
 
 
 def flight(**mocap):
-    """Boards of which one flies."""
+    """Boards, one of which flies."""
     box = {"box_min_m": [-2.0, -2.0, 0.5], "box_max_m": [2.0, 2.0, 2.0]}
     tables = bench_scenario().model_dump(mode="json") | {"mocap": {"rate_hz": 120.0, **mocap}}
     return uwbsim.load(tables, {"bodies.0.motion": {"model": "random-flight", "speed_mps": 1.0} | box})
@@ -254,7 +254,7 @@ def test_the_file_holds_every_pose_up_to_now_and_none_after(tmp_path):
         poses.write_until(round(now_s * 1e9))
         found = read_poses(tmp_path / "p.csv", None)
         late = (found.time_ns - EPOCH_NS) * 1e-9
-        # Three bodies; what is seen at t is told at t + 20 ms.
+        # Three bodies; a pose of time t is written at t + 20 ms.
         assert len(found) == 3 * (int((now_s - 0.02) * 120) + 1)
         assert now_s - 1 / 120 < late.max() <= now_s
     poses.close()
@@ -268,18 +268,18 @@ def test_poses_are_those_of_the_world_and_do_not_depend_on_the_pieces(tmp_path):
     mine = one.body == "b1"
     true = world.trajectories["b1"].position_m((one.time_ns[mine] - EPOCH_NS) * 1e-9)
     assert (one.position_m[mine] - true).std() == pytest.approx(0.001, rel=0.05)
-    # 20 gaps a minute of half a second each: a seventh of the time between them is blind.
+    # 20 gaps per minute of half a second each: a seventh of the time is without poses.
     assert 0.6 < (np.count_nonzero(mine) / (30 * 120)) < 0.95
     assert np.diff(one.time_ns[mine]).max() == pytest.approx(0.5e9, rel=0.1)
 
 
 def test_served_poses_go_on_after_the_scenario_s_duration(tmp_path):
-    scenario = flight(rate_hz=20.0)  # few enough that a busy machine keeps up with twenty times the boards' time
+    scenario = flight(rate_hz=20.0)  # few enough for a loaded machine at twenty times the time of the boards
     short = scenario.model_copy(update={"run": scenario.run.model_copy(update={"duration_s": 1.0})})
     with served(short, speed=20.0) as server:
         server.write_poses(tmp_path / "p.csv")
         for _ in range(2400):
-            # The file may grow between two looks at it, so only its complete lines count.
+            # The file may grow between two readings, so only its complete lines count.
             complete = (tmp_path / "p.csv").read_text().rpartition("\n")[0].splitlines()[1:]
             served_s = (int(complete[-1].partition(",")[0]) - server.epoch_ns) * 1e-9
             if served_s > 5.0:
@@ -289,7 +289,7 @@ def test_served_poses_go_on_after_the_scenario_s_duration(tmp_path):
 
 
 def test_a_step_ends_though_poses_take_longer_to_write_than_they_last(tmp_path):
-    # A tenth of a second of the boards is 5 us of the wall clock: the next poses are due before these are written.
+    # A tenth of a second of the boards is 5 us of real time: the next poses are due before these are written.
     with closing(Server(flight(rate_hz=0.2), speed=2e4)) as server:
         server.write_poses(tmp_path / "p.csv")
         for _ in range(3):
@@ -301,7 +301,7 @@ def test_poses_that_cannot_be_written_end_and_the_serving_goes_on(tmp_path):
     told: list[str] = []
     with served(flight(), tell=told.append) as server:
         server.write_poses(tmp_path / "p.csv")
-        # The first file is closed after the serving, which may be writing to it now.
+        # The first file is closed after the end of serving, which may be writing to it now.
         first, server._poses._file = server._poses._file, open("/dev/full", "w", encoding="utf-8")  # noqa: SIM115 - closed by the server
         for _ in range(100):
             with Board.open(server.names[2]) as board:
@@ -312,7 +312,7 @@ def test_poses_that_cannot_be_written_end_and_the_serving_goes_on(tmp_path):
     assert told == ["the poses end here: No space left on device"]
 
 
-# When carried boards stand, and that a server says so.
+# Intervals in which carried boards stand still, as printed by a server.
 
 
 def scenario(stays=((0.2, 0.1),), places=3):
@@ -326,13 +326,13 @@ def scenario(stays=((0.2, 0.1),), places=3):
     return uwbsim.load({"run": {"duration_s": 9.0}, "ranging": {"rate_hz": 20.0}, "bodies": bodies, "tags": tags})
 
 
-def test_boards_stand_while_nobody_is_carried():
+def test_boards_stand_still_while_no_body_is_carried():
     found = stays_s(scenario(((10.0, 2.0), (5.0, 4.0)), places=2))
     assert (found, stays_s(scenario(()))) == ([(0.0, 5.0), (9.0, 10.0), (12.0, math.inf)], [])
     assert stays_s(scenario(((10.0, 2.0),), places=1)) == [(0.0, math.inf)]
 
 
-def test_a_server_says_when_boards_stand():
+def test_a_server_prints_when_boards_stand_still():
     told: list[str] = []
     with closing(uwbsim.Server(scenario())) as server:
         server.announce(told.append)

@@ -1,4 +1,4 @@
-"""Scenes, comparisons and sweeps as pages: what stands on them, and how it lies in a window."""
+"""Scenes, comparisons and sweeps as pages: their content, and their layout in a window."""
 
 import csv
 import json
@@ -78,7 +78,7 @@ def test_a_timing_diagram_has_every_interval_with_its_length(name):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A scene, and a comparison in place of an older one, as commands write them."""
+    """A scene, and a comparison that replaces an older one, as written by commands."""
     folder = tmp_path_factory.mktemp("pages")
     processes.succeed("uwbsim", "show", NLOS_OFFICE, "-o", folder / "scene.html")
     (folder / "out").mkdir()
@@ -90,15 +90,15 @@ def folder(tmp_path_factory):
 
 @pytest.mark.parametrize("width", [pytest.param(1280, marks=pytest.mark.slow), 390])
 @pytest.mark.parametrize("name", ["scene", "out/compare"])
-def test_pages_lie_well(width, name, folder, tmp_path):
+def test_pages_of_simulations_fit_into_windows(width, name, folder, tmp_path):
     page = (folder / f"{name}.html").read_text()
     lies_well(page, width, tmp_path)
-    # Boards on a bench have one distance and one power, so nothing is drawn over these.
+    # Boards on a bench have one distance and one power, so no figure is drawn over these.
     assert (page.count("<figure>"), page.count("src='http")) == (5 if name == "scene" else 3, 0)
     assert ("log axis" in page) == ("logarithmic beyond" in page) == (name == "out/compare")
 
 
-def test_a_comparison_has_tables_and_json_and_takes_the_place_of_no_other(folder):
+def test_comparisons_have_tables_and_json_and_replace_no_files(folder):
     said = json.loads((folder / "told.json").read_text())["protocols"]
     assert [row["protocol"] for row in said] == list(PROTOCOLS)
     assert {p.name for p in (folder / "out").iterdir()} == {"compare.html", "compare.csv", "compare.parquet"}
@@ -107,7 +107,7 @@ def test_a_comparison_has_tables_and_json_and_takes_the_place_of_no_other(folder
     processes.refuse("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 10, naming=["--force"])
 
 
-def test_figures_for_a_paper_stand_in_a_folder_of_their_own_and_take_the_place_of_no_others(tmp_path, monkeypatch):
+def test_figures_for_papers_have_their_own_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "drawn", pages.outline)
     words = ["uwbsim", "compare", BENCH, "-n", 10, "--figures", tmp_path / "paper", "-o"]
     processes.succeed(*words, tmp_path / "out")
@@ -124,12 +124,12 @@ def test_protocols_far_apart_are_drawn_about_their_medians_and_whole_half_ticks_
     shown = histograms(7.16, {"ss": 2.8 + half * ticks, "ds": 0.05 + half * (ticks + 0.3)}).axes[0]
     hill: Any = shown.patches[0]
     heights = hill.get_data().values
-    # A normal density of 8 half ticks changes by 8 % of its top, at most, over one; a bin with one more by all of it.
+    # A normal density of 8 half ticks changes by at most 8 % of its maximum over one; a double bin by all of it.
     assert np.abs(np.diff(heights)).max() < 0.2 * heights.max()
-    # A protocol that is far wider fills the outermost bins, which do not flatten the others.
+    # A much wider protocol fills the outermost bins, which do not flatten the others.
     drawn = histograms(7.16, {"ss": np.random.default_rng(2).normal(0.0, 2.0, 20_000), "ds": half * ticks}).axes[0]
     assert drawn.get_ylim()[1] < 8
-    # Beyond some 7 cm on either side lie 48.5 % of errors of 2 m.
+    # 48.5 % of errors with 2 m are more than 7 cm on either side.
     assert {text.get_text() for text in drawn.texts} <= {"48 %", "49 %"}
     assert len(drawn.texts) == 2
     texts = [text.get_text() for text in shown.figure.legends[0].get_texts()]
@@ -141,7 +141,7 @@ def test_protocols_far_apart_are_drawn_about_their_medians_and_whole_half_ticks_
 
 
 def judged(flight):
-    """A figure that grows with what is varied, and another that stays."""
+    """A quantity that increases with the varied key, and one that is constant."""
     return {"spread_m": float(np.std(flight.exchanges.range_m - flight.truth_m)), "same": 1.0, "word": "none"}
 
 
@@ -155,7 +155,7 @@ def judged(flight):
         ("'compare', ranges = 50", "", "Figure 3. bias (cm): mean error of raw ranges."),
     ],
 )
-def test_a_sweep_draws_what_came_out_and_says_what_it_is(tmp_path, kind, more, caption):
+def test_sweeps_draw_their_results_with_labels(tmp_path, kind, more, caption):
     head = f"sweep = {{ scenario = '{BENCH.as_posix()}', kind = {kind}, protocols = ['ds'], seeds = 3 }}"
     (tmp_path / "plan.toml").write_text(f"{head}\n[vary]\n'radio.rx_noise_ps' = [50.0, 100.0, 200.0]\n{more}\n")
     design = uwbsim.load_design(tmp_path / "plan.toml", allow_files=[BENCH.parent])
@@ -204,7 +204,7 @@ def test_numbers_along_an_axis_do_not_cover_each_other(x):
         assert all(left.x1 + 2 < right.x0 for left, right in pairwise(one))
 
 
-def test_warnings_stand_below_the_table_of_pairs():
+def test_warnings_are_below_the_table_of_pairs():
     warned = [line.startswith("warning:") for line in str(uwbsim.preview("nlos_office/office")).splitlines()]
     assert any(warned)
     assert warned == sorted(warned)

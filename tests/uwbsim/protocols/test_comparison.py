@@ -1,4 +1,4 @@
-"""The workbench's commands: what they print, what they write, and what they refuse."""
+"""Commands that compare protocols: their output, their files, and their errors."""
 
 import json
 
@@ -27,12 +27,12 @@ def scenario():
     return load(TEST1)
 
 
-def test_predicted_stands_beside_simulated(scenario):
+def test_predictions_agree_with_simulations(scenario):
     found = compare(scenario, ROWS, 300_000)
     outcomes, samples = found.outcomes, found.samples
     assert [o.protocol for o in outcomes] == list(PROTOCOLS)
     for o in outcomes:
-        # Reflections: a heavy tail knows its mean to std/550 and its spread to 1 %.
+        # Reflections: with a heavy tail, the mean is known to std/550 and the spread to 1 %.
         assert o.bias_m == pytest.approx(o.predicted_bias_m, abs=4 * o.std_m / np.sqrt(300_000))
         assert o.std_m == pytest.approx(o.predicted_std_m, rel=0.02)
         assert o.rmse_m == pytest.approx(np.hypot(o.bias_m, o.std_m))
@@ -40,20 +40,21 @@ def test_predicted_stands_beside_simulated(scenario):
         assert len(samples[o.protocol]) == 200_000
 
 
-def test_an_exchange_takes_what_its_frames_and_replies_take(scenario):
+def test_the_duration_of_an_exchange_is_the_sum_of_frames_and_replies(scenario):
     ss, ds, sym = (costs(scenario, PROTOCOLS[name], 1e-3) for name in ("ss", "ds", "ds-sym"))
-    # A second round adds the boards' reply at once; the symmetric one a whole scheduled reply.
+    # A second round adds the boards' immediate reply; the symmetric one a whole scheduled reply.
     assert ds["duration_s"] - ss["duration_s"] == pytest.approx(305e-6, abs=1e-9)
     assert sym["duration_s"] - ds["duration_s"] == pytest.approx(1e-3 - 305e-6, abs=1e-9)
     assert ss["air_s"] < ds["air_s"] == sym["air_s"] < ds["duration_s"]
     assert ss["air_s"] < ss["radio_on_s"] < 2 * ss["duration_s"]
 
 
-def test_the_table_says_which_wins_where(scenario):
+def test_tables_name_the_best_protocol(scenario):
     rows = compare(scenario, ["ss-cfo", "ds"], 100).winners
-    # Short replies leave the carrier integrator little to spoil, and cost double-sided ranging its short third leg.
+    # With short replies, the carrier integrator has little effect, and double-sided ranging loses its short third
+    # interval.
     assert (rows[0]["rmse"], rows[-1]["rmse"]) == ("ss-cfo", "ds")
-    # What the carrier reads wrong on average stays, however many ranges are averaged.
+    # The mean error of carrier readings remains, however many ranges are averaged.
     assert {row["per_second"] for row in rows} == {"ds"}
 
 
@@ -72,7 +73,7 @@ def test_the_optimum_is_where_nothing_near_is_better(scenario):
     found = optimum(scenario, PROTOCOLS["ds"])
     assert not found.on_edge
     assert found.second_rms_m**2 <= found.second_m2.min() * (1 + 1e-9)
-    # (1 + r + r^2) (T + a), r = 305/T: the least of it, with the rest of the exchange a, by hand.
+    # (1 + r + r^2) (T + a), r = 305/T: its minimum, with the rest of the exchange a, by hand.
     delays = np.linspace(300e-6, 3e-3, 100_000)
     rest = costs(scenario, PROTOCOLS["ds"], 1e-3)["duration_s"] - 1e-3 + TURNAROUND_S
     r = 305e-6 / delays
@@ -83,12 +84,12 @@ def test_the_optimum_is_where_nothing_near_is_better(scenario):
 
 @pytest.mark.parametrize("name", ["ss", "ss-cfo", "ds", "ds-sym"])
 def test_a_bias_does_not_average_away(scenario, name):
-    """The mean of many simulated ranges of one state, beside what is predicted for it."""
+    """The mean of many simulated ranges of one state, compared with its prediction."""
     world = calibrated(conditions_of(scenario, 64))
     count = 400
     errors = range_errors_m(PROTOCOLS[name], world, 5, count * len(world)).reshape(count, len(world))
     predicted = predict(PROTOCOLS[name], world)
-    # Squares of 64 means are known to 18 %, so their root to 9 %; where skew rules, to much less.
+    # Squares of 64 means are known to 18 %, so their root to 9 %; much better if skew dominates.
     simulated = np.sqrt(np.mean(errors.mean(axis=0) ** 2))
     assert np.sqrt(predicted.mean_of(count)) == pytest.approx(simulated, rel=0.02 if name == "ss" else 0.25)
     assert np.sqrt(predicted.mean_of(1)) == pytest.approx(np.sqrt(np.mean(errors**2)), rel=0.03)
@@ -104,7 +105,7 @@ def test_compare_counts_as_many_exchanges_a_second_as_a_run_has(name):
     time_ns = simulate(crowded).exchanges.time_ns
     said = compare(crowded, [name], 1000).outcomes[0].rate_hz
     assert said == pytest.approx(fastest, rel=1e-9)
-    # Replies at once take 4 us longer on average than in the median, and a second has whole exchanges.
+    # Immediate replies take 4 us longer on average than in the median, and a second has whole exchanges.
     assert 1e9 * (len(time_ns) - 1) / np.ptp(time_ns) == pytest.approx(said, rel=0.004)
 
 
@@ -132,6 +133,6 @@ def test_predict_and_optimum_answer_in_words_and_json(tmp_path):
         (["run", TEST1, "-o", "o.uwb", "--through-wire", "--set", "ranging.protocol=ds-sym"], ["ds-sym", "boards"]),
     ],
 )
-def test_what_cannot_be_is_one_line(tmp_path, words, fragments):
+def test_wrong_arguments_of_comparisons_are_one_line(tmp_path, words, fragments):
     processes.refuse("uwbsim", *words, cwd=tmp_path, naming=fragments)
     assert not list(tmp_path.iterdir())

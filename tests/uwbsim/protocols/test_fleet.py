@@ -1,4 +1,4 @@
-"""What is predicted of a fleet, beside simulated broadcasts and exchanges, and by hand."""
+"""Predictions for fleets, compared with simulated broadcasts and exchanges, and by hand."""
 
 import json
 
@@ -18,7 +18,7 @@ LISTENER = (2.0, 2.5, 1.5)
 
 
 def fleet_world(white_ppm_sqrt_s=0.0, duration_s=20.0, **ranging):
-    """Return five tags that broadcast one after another and one that listens, all still, with noise of stamps."""
+    """Return five tags that broadcast in turn and one that listens, without motion, with noise of stamps."""
     places = PLACES | {9: LISTENER}
     world = {
         "run": {"seed": 8, "duration_s": duration_s},
@@ -35,7 +35,7 @@ def fleet_world(white_ppm_sqrt_s=0.0, duration_s=20.0, **ranging):
 
 
 def differences_m(heard):
-    """Return the differences of arrival of one listener, less the true ones."""
+    """Return the differences of arrival of one listener, minus the true ones."""
     h, places = heard, {k: np.array(p) for k, p in PLACES.items()}
     rate = elapsed(h["rx3"], h["rx2"], 40) / elapsed(h["tx3_n"], h["tx2_n"], 40)
     ticks = elapsed(h["rx2"], h["rx1"], 40) - rate * elapsed(h["tx2_n"], h["rx1_n"], 40)
@@ -52,7 +52,9 @@ def differences_m(heard):
     ],
 )
 def test_broadcasts_and_differences_err_as_predicted(white, seconds, part):
-    """20 s have 25 000 frames of five tags, a tenth as many for each pair: deviations are known to 1 %, of 4 s to 2."""
+    """20 s have 25,000 frames of five tags, a tenth as many for each pair: deviations are known to 1 %, from 4 s to 2
+    %.
+    """
     scenario = fleet_world(white, seconds)
     flight = uwbsim.simulate(scenario)
     found = {one.method: one for one in uwbsim.compare(scenario, ["ds"], 1).fleet}
@@ -61,14 +63,14 @@ def test_broadcasts_and_differences_err_as_predicted(white, seconds, part):
     assert found["broadcast"].rmse_m == pytest.approx(found["broadcast"].std_m, rel=0.01)
     heard = {name: column[flight.overheard["listener"] == 9] for name, column in flight.overheard.items()}
     assert np.std(differences_m(heard)) == pytest.approx(found["tdoa"].std_m, rel=part)
-    # Differences of neighbours in the round, alone: the reply is a slot of five.
+    # Differences of neighbours in the round only: the reply is one of five slots.
     reply = elapsed(heard["tx2_n"], heard["rx1_n"], 40) * TICK_S
     slot = 1 / scenario.ranging.rate_hz
     near = {name: column[reply < 1.5 * slot] for name, column in heard.items()}
     world = calibrated(conditions_of(scenario, 100))
     expected = np.sqrt(broadcast_variances_m2(world, slot, 5 * slot)[1].mean())
     assert np.std(differences_m(near)) == pytest.approx(expected, rel=part)
-    # Ten pairs a round; a range needs the round after it.
+    # Ten pairs per round; a range needs the next round.
     assert len(flight.exchanges) / seconds == pytest.approx(10 * found["broadcast"].update_hz, rel=0.02 / seconds)
     assert found["tdoa"].update_hz == found["broadcast"].update_hz
 
@@ -82,12 +84,12 @@ def test_costs_are_those_of_the_frames():
     cost = five["broadcast"].air_s, five["tdoa"].air_s, five["broadcast"].radio_on_s, five["tdoa"].radio_on_s
     assert cost == pytest.approx((frame_s / 2, frame_s * 5 / 4, frame_s * 5 / 2, frame_s * 5 / 4), rel=1e-4)
     assert five["broadcast"].update_hz == pytest.approx(1 / (5 * (frame_s + 300e-6)), rel=1e-4)
-    # Pairs take turns, so their updates fall with the square of the fleet, those of broadcasts with its size and with
-    # the longer frame: 127 bytes at most, with four blocks of parity.
+    # Pairs range in turn, so their updates decrease with the square of the fleet's size; those of broadcasts decrease
+    # with the size and with the length of the frame: at most 127 bytes, with four blocks of parity.
     assert five["ds"].update_hz / fifty["ds"].update_hz == pytest.approx(50 * 49 / 20)
     longest_s = 138.397e-6 + 21.538e-6 + (8 * 127 + 4 * 48) * 64 / 499.2e6
     assert fifty["tdoa"].update_hz == pytest.approx(1 / (50 * (longest_s + 300e-6)), rel=1e-4)
-    # Replies take a fifth or two of a round; frames of one tag count by 1 - 3/2 r^2 (1 - r^2), three others by 1.
+    # Replies take a fifth or two of a round; frames of one tag have the weight 1 - 3/2 r^2 (1 - r^2), three others 1.
     metre_s = 100e-12 * SPEED_OF_LIGHT
     ratios = np.array([0.2, 0.4])
     saved = 1.5 * np.mean(ratios**2 - ratios**4)

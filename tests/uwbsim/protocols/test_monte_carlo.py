@@ -1,4 +1,4 @@
-"""The Monte Carlo in columns against the event loop with its integer stamps, and against what theory says."""
+"""The Monte Carlo simulation compared with the event loop with its integer stamps, and with theory."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +22,7 @@ SOME_SLOW = [pytest.param(name, marks=[] if name in ("ss", "ds") else pytest.mar
 
 
 def world(count=16_384, **values):
-    """Five metres, clocks 10 ppm apart, the boards' delays; `values` change that."""
+    """Return a world of five metres, clocks 10 ppm apart, and the boards' delays; `values` change that."""
     start = {"flight": 5 / SPEED_OF_LIGHT, "rate": (5e-6, -5e-6), "at_once": 305e-6}
     plain = {k: values.pop(k) for k in list(values) if k in ("quantize", "multipath", "detour_s", "carrier_std_ppm")}
     one = Conditions.single(**(start | {"scheduled": 1538.7e-6} | values), **plain)
@@ -45,12 +45,12 @@ def test_means_and_variances_are_those_of_integer_stamps(name):
     scenario = uwbsim.load(SCENARIOS / "icra2023" / "test1.toml", settings)
     flight = uwbsim.simulate(scenario, contention=False)
     exact = raw_range(flight.exchanges) - flight.truth_m
-    # The same 30 000 states, so what remains is the noise: 300 000 ranges against them.
+    # The same 30,000 states, so only the noise differs: 300,000 ranges each.
     states = conditions_of(scenario, 30_000)
     fast = range_errors_m(PROTOCOLS[name], states, 7, 300_000)
     within = predict(PROTOCOLS[name], states).variance_m2.mean()
     assert abs(exact.mean() - fast.mean()) < 4 * np.sqrt(within * (1 / len(exact) + 1 / len(fast)))
-    # 30 000 heavy-tailed errors know their variance to 1.5 %.
+    # The variance of 30,000 heavy-tailed errors is known to 1.5 %.
     assert exact.var() == pytest.approx(fast.var(), rel=0.06)
 
 
@@ -73,7 +73,7 @@ def test_the_prediction_holds(name, values):
     errors = range_errors_m(PROTOCOLS[name], c, 11, 250_000)
     mean, variance = predict(PROTOCOLS[name], c).pooled()
     assert abs(errors.mean() - mean) < 4 * np.sqrt(variance / 250_000) + 2e-6
-    # Variance of normal errors is known to 0.3 %, of exponential detours to 1 %; two sigma of that.
+    # The variance of normal errors is known to 0.3 %, that of exponential detours to 1 %; two sigma of that.
     assert errors.var() == pytest.approx(variance, rel=0.02)
 
 
@@ -84,7 +84,7 @@ def test_without_noise_the_prediction_is_exact(name):
         flight_rate=4e-9, drift=(2e-6, -1e-6),
     )  # fmt: skip
     (error,) = range_errors_m(PROTOCOLS[name], c, 1, 1)
-    # Half a nanometre: what floats of a second lose in a millisecond.
+    # Half a nanometre: the rounding of floats of a second at a millisecond.
     assert predict(PROTOCOLS[name], c).mean_m[0] == pytest.approx(error, abs=1e-6)
 
 
@@ -108,8 +108,9 @@ def test_double_sided_variance_is_the_papers(share):
 
 
 def test_the_alternative_is_neiryncks():
-    """Equal replies halve the weight of each reading: 3/4 of single-sided variance (four stamps count half each, two
-    count for both), and the bias is the flight times the mean skew."""
+    """Equal replies halve the weight of each stamp: 3/4 of the single-sided variance (four stamps with half the weight,
+    two with all, for both), and the bias is the flight times the mean skew.
+    """
     c = world(1, rx_std=1e-10, tx_std=1e-10)
     single = (SPEED_OF_LIGHT * 1e-10) ** 2
     assert predict(PROTOCOLS["ds-sym"], c).variance_m2[0] == pytest.approx(0.75 * single, rel=1e-3)
@@ -156,7 +157,7 @@ def test_a_world_of_many_states_meets_each_in_turn():
     np.testing.assert_allclose(errors, np.array([0, 1, 2, 0, 1, 2, 0]) * 1e-9 * SPEED_OF_LIGHT, atol=1e-4)
 
 
-# What the workbench takes, and what it refuses: parameters by name, in one line.
+# Accepted and refused arguments of comparisons: parameters by name, in one line.
 
 
 NOISELESS = Path(__file__).parents[3] / "scenarios" / "noiseless.toml"
@@ -203,7 +204,7 @@ def test_results_print_themselves():
         ),
     ],
 )
-def test_arguments_that_cannot_be(call, message):
+def test_wrong_arguments_are_refused(call, message):
     with pytest.raises(uwbsim.ParameterError, match=one_line(message)) as caught:
         call()
     assert "--" not in str(caught.value)
@@ -217,7 +218,7 @@ def test_a_scenario_that_plans_no_exchange_is_refused(call):
         call(uwbsim.load(NOISELESS, {"run.duration_s": 0.001}))
 
 
-# What white noise of clocks' rates costs protocols: flights, Monte Carlo and prediction against closed forms.
+# Effect of white noise of clock rates on protocols: flights, Monte Carlo and prediction compared with closed forms.
 
 
 WHITE = 0.01e-6
@@ -249,12 +250,14 @@ def errors_m(world):
 
 
 def closed_form_m(protocol, uus=1500):
-    """From phases that wander independently over the spans of the formulas, whose flights are negligible."""
+    """Return the standard deviation from phases that change independently over the intervals of the formulas, without
+    flights.
+    """
     wait = uus * UUS_S
     if protocol == "ss":
-        # Half of the difference of what two clocks gather over the reply.
+        # Half of the difference that two clocks gather over the reply.
         return SPEED_OF_LIGHT * WHITE * np.sqrt(2 * wait) / 2
-    # dt41 - K dt32: both clocks over the reply, and both over the wait, by which K = dt64/dt53 is known.
+    # dt41 - K dt32: both clocks over the reply, and both over the interval that determines K = dt64/dt53.
     return SPEED_OF_LIGHT * WHITE * np.sqrt(2 * REPLY_S * (1 + REPLY_S / wait)) / 2
 
 
@@ -276,5 +279,5 @@ def test_prediction_has_the_closed_form(protocol):
 def test_served_boards_lose_as_much():
     first = Board(uwbsim.VirtualPorts(scenario()).port(1))
     ranges = [first.range(2).range_m for _ in range(200)]
-    # 200 exchanges know a deviation to 5 %; whole ticks and the grid are in it, too.
+    # 200 exchanges determine a deviation to 5 %, which includes whole ticks and the grid.
     assert np.std(ranges) == pytest.approx(closed_form_m("ds"), rel=0.15)

@@ -1,4 +1,4 @@
-"""Keys of files of scenarios, faults and sweeps: limits, overrides, descriptions, and the schema that is printed."""
+"""Keys of scenarios, faults and sweeps: limits, overrides, descriptions, and the printed schema."""
 
 import json
 import re
@@ -91,7 +91,7 @@ def test_the_reference_says_unit_default_and_range():
     assert [unit_of(key) for key in ("skew_ppm_per_sqrt_s", "duration_s", "antenna")] == ["ppm/√s", "s", ""]
 
 
-# Scenarios of the world: what cannot be is one clear line, and what is named is read.
+# Errors in scenarios are one line; the files that they name are read.
 
 
 OFFICE = ROOT / "scenarios" / "nlos_office" / "office.toml"
@@ -136,7 +136,7 @@ def changed(tmp_path, old, new):
         ("speed_mps = 0.8\nacceleration", "times_s = [1, 2]\nspeed_mps = 0.8\nacceleration", ["times_s", "either"]),
     ],
 )
-def test_worlds_that_cannot_be(tmp_path, old, new, fragments):
+def test_wrong_worlds_are_refused(tmp_path, old, new, fragments):
     with pytest.raises(uwbsim.ScenarioError, match=one_line(*fragments)):
         uwbsim.simulate(uwbsim.load(changed(tmp_path, old, new)))
 
@@ -191,7 +191,7 @@ def planned(tmp_path, slots):
         ("9,1,3\n7,3,1\n", r"first slot is at 7 s, after the end of the run \(run.duration_s = 6\)"),
     ],
 )
-def test_a_plan_file_that_cannot_be_is_refused(tmp_path, slots, message):
+def test_wrong_plan_files_of_scenarios_are_refused(tmp_path, slots, message):
     with pytest.raises(uwbsim.ScenarioError, match=message):
         uwbsim.load(planned(tmp_path, slots), ["run.duration_s=6"])
 
@@ -207,7 +207,7 @@ def test_common_random_numbers():
     base = ["run.duration_s=10", "radio.rx_noise_ps=100", "radio.power_noise_db=0.5", "radio.skew_noise_ppm=0.2"]
     one = uwbsim.simulate(uwbsim.load(NOISELESS, base))
     other = uwbsim.simulate(uwbsim.load(NOISELESS, [*base, "tags.0.skew_ppm=5.5", "tags.0.delay_ns=0.9"]))
-    # Another clock moves when exchanges happen by microseconds, and nothing else of what chance decides.
+    # Another clock shifts exchanges by microseconds, and changes no other random value.
     np.testing.assert_array_equal(one.poses.position_m, other.poses.position_m)
     np.testing.assert_allclose(one.exchanges.fpp1_dbm, other.exchanges.fpp1_dbm, atol=1e-2)
     without = (one.exchanges.initiator != 1) & (one.exchanges.target != 1)
@@ -257,17 +257,17 @@ def test_listed_success_counts_failures(tmp_path):
         assert sum(p["exchanges"] for p in shown["pairs"]) == recording.count("exchanges")
 
 
-# Scenarios that come along, by name: found, listed, copied.
+# Scenarios of the package by name: found, listed, copied.
 
 
-def test_every_one_is_told_of():
+def test_every_scenario_has_a_description():
     told = listed()
     assert list(told) == list(shipped_scenarios()) == sorted(told)
     assert all(4 < len(text) < 200 for text in told.values())
     assert len(set(told.values())) == len(told), "two are told of alike"
 
 
-def test_a_name_does_for_a_file_where_there_is_none(tmp_path, monkeypatch):
+def test_names_of_scenarios_replace_missing_files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert uwbsim.load("nlos_office/office") == uwbsim.load(shipped_scenarios()["nlos_office/office"])
     assert uwbsim.load("noiseless.toml") == uwbsim.load("noiseless")

@@ -1,4 +1,4 @@
-"""The air: durations, collisions, capture, busy boards, and waits."""
+"""Frames in the air: durations, collisions, capture, busy boards, and waits."""
 
 from pathlib import Path
 
@@ -43,7 +43,7 @@ def played(hosts, powers=None, progress=None):
 
 
 def with_powers(*changes, everywhere=-80.0):
-    """Powers by sender and receiver, all the same but for some."""
+    """Return powers by sender and receiver, equal except for some."""
     powers = np.full((8, 8), everywhere)
     for sender, receiver, power_dbm in changes:
         powers[sender, receiver] = power_dbm
@@ -51,12 +51,12 @@ def with_powers(*changes, everywhere=-80.0):
 
 
 WEAKER = with_powers((2, slice(None), -95.0), (2, 3, -80.0))
-"""The second initiator is 15 dB weaker everywhere but at its own target."""
+"""The second initiator is 15 dB weaker everywhere except at its own target."""
 
 APART = with_powers(([[0], [1]], [2, 3], -120.0), ([[2], [3]], [0, 1], -120.0))
 CHAIN = with_powers(([[0], [1], [2]], [0, 1, 2], -80.0), everywhere=-120.0)
 TWO = [[slot(0, 0, 0, 1)], [slot(1, 50, 2, 3)]]
-"""A second exchange that begins 50 us after the first."""
+"""A second exchange that starts 50 us after the first."""
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ TWO = [[slot(0, 0, 0, 1)], [slot(1, 50, 2, 3)]]
         pytest.param([[slot(0, 0, 0, 1), slot(1, 5000, 1, 2)]], None, ["", ""], id="alone"),
         pytest.param(TWO, None, [air.COLLIDED] * 2, id="two polls at equal power"),
         pytest.param(TWO, WEAKER, ["", air.COLLIDED], id="stronger and earlier"),
-        # The receiver is locked on the other.
+        # The receiver is locked to the other one.
         pytest.param([[slot(0, 50, 0, 1)], [slot(1, 0, 2, 3)]], WEAKER, [air.COLLIDED, None], id="stronger but later"),
         pytest.param(TWO, APART, ["", ""], id="too far away"),
         pytest.param([[slot(0, 0, 0, 1)], [slot(1, 900, 2, 1)]], None, [None, air.BUSY], id="target in an exchange"),
@@ -76,7 +76,7 @@ TWO = [[slot(0, 0, 0, 1)], [slot(1, 50, 2, 3)]]
             id="a target keeps to its exchange though nobody hears its answer",
         ),
         pytest.param([[slot(0, 0, 0, 1, final_us=6900)]], None, [air.LATE], id="a final after the preamble timeout"),
-        # The second poll is over before the first exchange begins to wait for anything.
+        # The second poll ends before the first exchange waits for a frame.
         pytest.param(
             [[slot(0, 1000, 0, 1)], [slot(1, 0, 2, 3, (False, True, True))]], None, ["", air.WEAK], id="ended before"
         ),
@@ -87,7 +87,7 @@ TWO = [[slot(0, 0, 0, 1)], [slot(1, 50, 2, 3)]]
             [air.COLLIDED, None, None],
             id="behind one that is too weak another collides",
         ),
-        # The second poll falls between the first exchange's response and its final.
+        # The second poll is between response and final of the first exchange.
         pytest.param([[slot(0, 0, 0, 1)], [slot(1, 800, 2, 3)]], None, [air.FOREIGN, None], id="the first that comes"),
         pytest.param(TWO, with_powers(([[2], [3]], [0, 1], -86.0)), ["", None], id="captured from 6 dB on"),
         pytest.param(TWO, with_powers(([[2], [3]], [0, 1], -85.99)), [air.COLLIDED, None], id="not captured below"),
@@ -97,7 +97,7 @@ TWO = [[slot(0, 0, 0, 1)], [slot(1, 50, 2, 3)]]
         pytest.param(TWO, with_powers(([0, 1], [1, 0], -97.0), everywhere=-100.01), ["", None], id="below it"),
     ],
 )
-def test_what_becomes_of_exchanges_that_meet(hosts, powers, reasons):
+def test_colliding_exchanges_end_as_planned(hosts, powers, reasons):
     outcome = played(hosts, powers)
     named = [found if reason is not None else None for found, reason in zip(outcome.reason, reasons, strict=True)]
     assert named == reasons
@@ -109,18 +109,18 @@ def test_the_message_that_is_lost_is_named():
 
 
 FINAL_US = 305 + 1538 + after_marker_s(28) * 1e6 + before_marker_s(128) * 1e6
-"""From the marker of a poll to that of the next, right after the final has ended."""
+"""From the marker of a poll to that of the next, started just after the end of the final."""
 
 
 @pytest.mark.parametrize(
     ("hosts", "between_us"),
     [
         ([[slot(0, 0, 0, 1), slot(1, 5000, 1, 2)]], 5000),
-        # The rest of the poll, the receiver going on, the wait, the next command, its preamble.
+        # The rest of the poll, the end of reception, the wait, the next command, its preamble.
         ([[slot(0, 0, 0, 1, (True, False, True)), slot(1, 100, 0, 1)]], 39 + 40 + 6521 + 1000 + 138.4),
         ([[slot(0, 0, 0, 1), slot(1, 5000, 0, 1, pause_us=250)]], 5250),
         ([[slot(0, 0, 0, 1), slot(1, 10, 0, 1)]], FINAL_US + 1000),
-        # An initiator that is being ranged with waits until it is free.
+        # An initiator that is a target at that time waits until it is free.
         ([[slot(0, 0, 0, 1)], [slot(1, 600, 1, 2)]], FINAL_US),
         ([[slot(0, 50_000, 0, 1)], [slot(1, 50_600, 1, 2)]], FINAL_US),
     ],
@@ -130,7 +130,7 @@ def test_exchanges_start_when_they_should(hosts, between_us):
     assert (outcome.lost[1], np.diff(outcome.start)[0] / US) == (-1, pytest.approx(between_us, abs=2))
 
 
-def test_progress_is_told_for_every_500th_slot_as_a_share_of_all_hosts():
+def test_progress_is_reported_every_500_slots_as_a_share_of_all_hosts():
     told: list[float] = []
     hosts = [[slot(k, 3000 * k, 0, 1) for k in range(501)], [slot(501, 0, 4, 5)]]
     powers = np.full((8, 8), -120.0)
@@ -146,7 +146,7 @@ def with_replies(reply):
 
 def test_replies_are_drawn_from_two_modes_a_shoulder_and_a_tail():
     micro = with_replies({"model": "boards"}).ranging.reply.draw_s(stream(1, "reply"), 400_000) * 1e6
-    # 400 000 draws know a share to 0.0008.
+    # 400,000 draws determine a share to 0.0008.
     for below_us, share in ((304.1, 0.207), (305.9, 0.635), (308.3, 0.885), (310.0, 0.9096), (348.25, 0.955)):
         assert np.mean(micro < below_us) == pytest.approx(share, abs=0.003), below_us
     assert (micro.min(), micro.max()) == (pytest.approx(303.4, abs=1e-6), pytest.approx(386.25, abs=0.25))
@@ -159,7 +159,7 @@ def test_detours_have_the_share_and_the_mean_of_the_scenario_and_noise_is_standa
     detours = drawn.excess_m[drawn.excess_m > 0]
     assert len(detours) / drawn.excess_m.size == pytest.approx(0.2, abs=0.005)
     assert detours.mean() == pytest.approx(0.5, rel=0.03)
-    # Six sequences of 100 000: their covariances are known to 0.003.
+    # Six sequences of 100,000: their covariances are known to 0.003.
     noise = np.column_stack([drawn.transmit, drawn.receive]).T
     np.testing.assert_allclose(np.cov(noise), np.eye(6), atol=0.015)
     assert np.abs(noise.mean(axis=1)).max() < 0.015
@@ -196,7 +196,7 @@ def test_what_is_one_event_ends_as_message_by_message(monkeypatch, plan, rate_hz
     np.testing.assert_array_equal(quick.exchanges.rx3, slow.exchanges.rx3)
 
 
-# What passive tags overhear, and impulse responses, against known geometry.
+# Frames that passive tags overhear, and impulse responses, compared with known geometry.
 
 
 PLACES = {1: (0.0, 0.0, 0.0), 2: (4.0, 0.0, 0.0), 3: (1.0, 3.0, 0.0), 4: (60.0, 0.0, 0.0)}
@@ -224,13 +224,13 @@ def flight(protocol="ds", passive=(3,), room=None, get_cir=False, **radio):
 def test_a_listener_measures_the_differences_of_distance():
     heard = flight().overheard
     assert (len(heard["rx1"]), set(heard["listener"].tolist())) == (100, {3})
-    # rx2 - rx1 at the listener is rx2's way more: target's reply plus both flights, less the initiator's way.
+    # rx2 - rx1 at the listener: the target's reply plus both flights and the response's path, minus the poll's path.
     d12, d13, d23 = 4.0, np.hypot(1, 3), np.hypot(3, 3)
     reply = elapsed(heard["tx2_n"], heard["rx1_n"])
-    rate = 1 + (1.0 - (-3.0)) * 1e-6  # of the listener's clock against the target's
+    rate = 1 + (1.0 - (-3.0)) * 1e-6  # of the listener's clock relative to the target's
     expected = reply * rate + (d12 + d23 - d13) / METRES_PER_TICK
     np.testing.assert_allclose(elapsed(heard["rx2"], heard["rx1"]), expected, atol=1.5)
-    # The third message comes dt53 after the second, from the same tag: no geometry, only clocks.
+    # The third message comes dt53 after the second, from the same tag: independent of geometry.
     third = elapsed(heard["tx3_n"], heard["tx2_n"]) * rate
     np.testing.assert_allclose(elapsed(heard["rx3"], heard["rx2"]), third, atol=1.5)
     np.testing.assert_allclose(heard["skew1_ppm"], 1.0 - 2.0, atol=0.002)
@@ -241,7 +241,7 @@ def test_a_single_sided_exchange_has_no_third_reception():
     assert (heard["rx3"].any(), np.isnan(heard["fpp3_dbm"]).all()) == (False, True)
 
 
-def test_who_is_too_far_hears_nothing_and_listening_changes_nothing_else():
+def test_far_listeners_receive_nothing_and_listening_has_no_effect():
     near, both = flight(), flight(passive=(3, 4), sensitivity_dbm=-105.0)
     assert len(flight(passive=(4,), sensitivity_dbm=-92.0).overheard["rx1"]) == 0
     np.testing.assert_array_equal(near.exchanges.rx2, both.exchanges.rx2)
@@ -256,6 +256,6 @@ def test_impulse_responses_agree_with_stamp_and_room():
         assert (len(taps), index % 1) == (1016, pytest.approx(stamp % 64 / 64, abs=0.001))
         # The floor is 1.5 m below: 5 m instead of 4 m, 3.3 ns or taps later.
         echo = round(index + 1.5 + 1.0 / 0.299702547)
-        # Half the amplitude of the first path, which diffuse ones of a quarter disturb.
+        # Half of the amplitude of the first path, with diffuse paths of a quarter.
         assert taps[echo - 1 : echo + 2].max() > taps.max() / 6
         assert taps[: int(index) - 6].max() < 400

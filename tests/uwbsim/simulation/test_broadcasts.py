@@ -1,4 +1,4 @@
-"""Tags that broadcast in turn and tags that only listen, by geometry, planted delays, and loops over frames."""
+"""Tags that broadcast in turn and tags that only listen: geometry, planted delays, and loops over frames."""
 
 import json
 from typing import Any
@@ -58,7 +58,7 @@ def still():
 
 
 def test_ranges_are_the_distances_less_the_planted_delays(still):
-    """Six stamps of a range are rounded to 15.65 ps: single ranges are within 30 ps, means of 200 within 1.5."""
+    """Six stamps of a range are rounded to 15.65 ps: single ranges are within 30 ps, means of 200 within 1.5 ps."""
     e = still.exchanges
     pairs = by_pair(e.initiator, e.target)
     assert {tuple(sorted(pair[:2])) for pair in pairs} == {(a, b) for a in range(1, 5) for b in range(a + 1, 5)}
@@ -70,7 +70,7 @@ def test_ranges_are_the_distances_less_the_planted_delays(still):
 
 
 def test_noise_is_of_the_stamps_and_the_departure_is_one_for_all(still):
-    """With transmit noise alone all listeners share it: their differences have only rounding, 4.5 ps each."""
+    """Transmit noise alone is common to all listeners: their differences have only rounding errors, 4.5 ps each."""
     r = table(uwbsim.simulate(world(radio={"tx_noise_ps": 500.0}, tags={"skew_ppm": 0.0})))
     first = r[(r.sender == 1) & (r.listener == 2)], r[(r.sender == 1) & (r.listener == 9)]
     late = [elapsed(one.rx, one.tx, 40) * TICK_S for one in first]
@@ -79,7 +79,9 @@ def test_noise_is_of_the_stamps_and_the_departure_is_one_for_all(still):
 
 
 def test_moving_tags_range_as_their_poses_say():
-    """K has the Doppler shift, so a reply extrapolates the distance: d(1) and d(2) less its change over the reply."""
+    """K contains the Doppler shift, so a reply extrapolates the distance: d(1), and d(2) minus its change over the
+    reply.
+    """
     box = {"box_min_m": [1.0, 1.0, 0.4], "box_max_m": [4.0, 5.0, 2.4], "speed_mps": 1.5}
     flight = uwbsim.simulate(world(motion={2: {"model": "random-flight"} | box}, tags={"delay_ns": 0.0}))
     e, p = flight.exchanges, flight.poses
@@ -97,7 +99,7 @@ def test_moving_tags_range_as_their_poses_say():
         ends.append(place)
     d = np.linalg.norm(ends[0] - ends[1], axis=2)
     expected = (d[0] + d[1] - (d[2] - d[1]) / intervals(e).dt53 * intervals(e).dt32) / 2
-    # Poses every 10 ms with accelerations of some 10 m/s^2 are interpolated to 0.1 mm, stamps rounded to 30 ps or 9 mm.
+    # Poses every 10 ms with accelerations of 10 m/s^2 are interpolated to 0.1 mm, stamps rounded to 30 ps or 9 mm.
     errors = raw_range(e) - expected
     assert np.abs(errors).max() < 0.01
     assert abs(errors.mean()) < 0.0005
@@ -130,7 +132,7 @@ def test_frames_that_overlap_are_lost_as_powers_and_times_say():
     assert found.faults[0].detail.endswith(("frame collision", "frame receiver busy"))
 
 
-def test_who_is_out_of_range_hears_nothing_and_ranges_with_nobody():
+def test_boards_out_of_range_receive_no_frames_and_have_no_ranges():
     far = uwbsim.simulate(world(places=PLACES | {4: (900.0, 0.0, 0.0)}))
     r = table(far)
     assert 4 not in [*r.sender, *r.listener]
@@ -151,7 +153,7 @@ def test_the_recording_holds_receptions_and_the_exchanges_that_they_make(tmp_pat
     assert len(overheard["rx3"]) == len(held.overheard["rx3"]) > 0
     ranged = held.exchanges.initiator.tolist() + held.exchanges.target.tolist()
     assert {10, 11} <= set(held.overheard["listener"].tolist()) - set(ranged)
-    # Seven pairs of 49 ranges with 85 ps of noise, in which a delay counts half, tell it to 10 ps; four of these.
+    # Seven pairs of 49 ranges with 85 ps of noise, half of a delay each, determine it to 10 ps; four of these.
     fitted = processes.succeed("calib", "fit", out, "-o", tmp_path / "c.json", "--delays-only", "--json")
     found = json.loads(fitted.stdout)["delays_ns"]
     planted = held.meta["planted"]["delays_ns"]

@@ -1,4 +1,4 @@
-"""Simulated ranges against what theory says of skew, noise and the firmware's grids (docs/theory.md)."""
+"""Simulated ranges compared with theory: skew, noise and the grids of the firmware (docs/theory.md)."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 
 
 def bench(protocol="ds", skews=(0.0, 0.0), reply_us=305.0, delay=1500, n=400, delays=(0.0, 0.0), seed=1, **radio):
-    """Two tags 3.1234 m apart that do not move."""
+    """Return two tags 3.1234 m apart that do not move."""
     quiet = {"rx_noise_ps": 0.0, "skew_noise_ppm": 0.0, "skew_bias_ppm": 0.0, "quantize": False}
     return Scenario.model_validate(
         {
@@ -55,7 +55,7 @@ def test_noiseless_ranges_are_true_within_a_tick(protocol, skews):
     ("skews", "delay"), [((20.0, -20.0), 293), ((-20.0, 20.0), 1500), ((10.0, 0.0), 4875), ((0.0, 7.5), 1500)]
 )
 def test_single_sided_bias_follows_the_relative_skew(skews, delay):
-    # 20 ps of jitter dithers the rounding to ticks; 2000 ranges leave 0.1 mm of it in the mean.
+    # 20 ps of jitter dithers the rounding to ticks; 2000 ranges have an error of 0.1 mm of it in the mean.
     result = simulate(bench("ss", skews, delay=delay, n=2000, rx_noise_ps=20.0))
     reply_s = intervals(result.exchanges).dt32.mean() / 63.8976e9
     expected = SPEED_OF_LIGHT / 2 * (skews[0] - skews[1]) * 1e-6 * reply_s
@@ -66,7 +66,7 @@ def test_single_sided_bias_follows_the_relative_skew(skews, delay):
     ("skews", "reply_us"), [((20.0, -20.0), 300.0), ((-20.0, 20.0), 1500.0), ((10.0, 0.0), 5000.0)]
 )
 def test_double_sided_bias_stays_below_a_millimetre(skews, reply_us):
-    # At 5 ms the third message costs r^2 = 10 times the variance: 20 ps keep the mean's error at 0.3 mm.
+    # At 5 ms, the third message causes r^2 = 10 times the variance: with 20 ps, the error of the mean is 0.3 mm.
     result = simulate(bench("ds", skews, reply_us=reply_us, delay=1500, n=2000, rx_noise_ps=20.0))
     assert abs(np.mean(raw_range(result.exchanges) - result.truth_m)) < 1e-3
 
@@ -74,7 +74,7 @@ def test_double_sided_bias_stays_below_a_millimetre(skews, reply_us):
 @pytest.mark.parametrize("protocol", ["ss", "ds"])
 @pytest.mark.parametrize("noise_ps", [(150.0, 150.0), (150.0, 0.0), (0.0, 150.0)])
 def test_standard_deviation_follows_the_formula(protocol, noise_ps):
-    # 20 000 ranges know their standard deviation to 0.5 %, so 2 % is four sigma; rounding adds 0.1 %.
+    # 20,000 ranges determine their standard deviation to 0.5 %, so 2 % is four sigma; rounding adds 0.1 %.
     scenario = bench(protocol, n=20_000, tx_noise_ps=noise_ps[0], rx_noise_ps=noise_ps[1], seed=5)
     e = simulate(scenario, contention=False).exchanges
     spans = intervals(e)
@@ -89,7 +89,7 @@ def test_same_seed_same_columns_and_another_seed_others():
     assert np.any(first.rx2 != other.rx2)
 
 
-# Plans: who ranges when, and how often it works.
+# Plans: order and times of exchanges, and their success.
 
 
 def ring(count=6, **ranging):
@@ -131,8 +131,8 @@ def test_turns_do_not_collide_and_random_talk_does_the_more_the_more_there_is():
     assert success("tdma", sync_error_ms=0.05) == 1.0
     shares = [success("aloha", rate=rate) for rate in (20.0, 60.0, 180.0)]
     assert shares[0] > shares[1] > shares[2]
-    # An exchange takes 2.0 ms. Were every start of the 5/6 x 60 Hz others within one of them before or after fatal,
-    # exp(-50 Hz x 4.0 ms) = 0.82 would survive; were only those that begin in it, exp(-50 Hz x 2.0 ms) = 0.90.
+    # An exchange takes 2.0 ms. If all starts of the 5/6 x 60 Hz others within one exchange before or after were fatal,
+    # exp(-50 Hz x 4.0 ms) = 0.82 would survive; if only those during it were, exp(-50 Hz x 2.0 ms) = 0.90.
     assert 0.82 - 0.03 < shares[1] < 0.90 + 0.03
 
 
@@ -146,7 +146,7 @@ def test_a_list_waits_for_who_cannot_hear_the_one_before():
     far = near.model_copy(update={"radio": near.radio.model_copy(update={"first_path_at_1m_dbm": -92.0})})
     gaps = [np.diff(simulate(world).exchanges.time_ns[:101]) * 1e-9 for world in (near, far)]
     np.testing.assert_allclose(gaps[0], 0.1, atol=1e-4)
-    # -106.3 dBm at 5.2 m are below the sensitivity: each but the first begins 50 ms later than planned.
+    # -106.3 dBm at 5.2 m are below the sensitivity: each but the first starts 50 ms later than planned.
     np.testing.assert_allclose(gaps[1], [0.15] + [0.1] * 99, atol=1e-4)
 
 

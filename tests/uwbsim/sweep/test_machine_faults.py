@@ -1,4 +1,4 @@
-"""Sweeps while their machines misbehave: a damaged store, two sweeps on one folder, a scheduler that goes away."""
+"""Sweeps during faults of computers: a damaged store, two sweeps in one folder, a scheduler that ends."""
 
 import contextlib
 import os
@@ -110,7 +110,7 @@ def test_a_full_disk_ends_a_sweep_with_one_line_and_keeps_what_was_done(tmp_path
     words = ("uwbsim", "sweep", tmp_path / "plan.toml", "-o", tmp_path / "out", "--workers", "1")
     refuse(*words, most_bytes=8000)
     assert not (tmp_path / "out" / "results.csv").exists()
-    # Once there is room again, the same command does it.
+    # With space on the disk again, the same command continues.
     (tmp_path / "out" / "results.duckdb").unlink(missing_ok=True)
     succeed(*words)
 
@@ -137,7 +137,7 @@ def test_a_scheduler_that_goes_away_is_named_and_what_was_done_is_kept(tmp_path)
         gone = pytest.raises(
             ClusterLostError, match=rf"^{address}: the connection to the scheduler is lost; results so far are kept"
         )
-        # The client tries to come back for so long, half a minute otherwise.
+        # Time during which the client tries to reconnect; the default is half a minute.
         with dask.config.set({"distributed.comm.timeouts.connect": "1s"}), gone:
             run_sweep(p, tmp_path / "out", scheduler=address, progress=lambda _: cluster.kill())
     with ResultStore.open(tmp_path / "out" / "results.duckdb") as store:
@@ -155,7 +155,7 @@ ENDLESS = "sweep = { scenario = 'noiseless', protocols = ['ds'], ranges = 20000,
 
 
 def session(leader):
-    """The processes of a session that still run."""
+    """Return the processes of a session that still run."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
@@ -181,7 +181,8 @@ def test_a_sweep_that_ends_early_leaves_no_worker_and_goes_on_where_it_was(tmp_p
         # The log grows with every result; ten thousand bytes are a few of them.
         log = out / "results.duckdb.wal"
         wait_until(lambda: log.exists() and log.stat().st_size > 10_000)
-        # Workers leave Ctrl-C, which a terminal sends to all of them, to the sweep, and can be terminated.
+        # Workers ignore Ctrl-C, which a terminal sends to all of them, so that the sweep handles it; they can be
+        # terminated.
         blocked = [signals_blocked(pid) for pid in session(process.pid)]
         assert [sum(one in some for some in blocked) for one in (signal.SIGINT, signal.SIGTERM)] == [2, 0]
         (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
@@ -190,7 +191,7 @@ def test_a_sweep_that_ends_early_leaves_no_worker_and_goes_on_where_it_was(tmp_p
     finally:
         for left in session(process.pid):
             os.kill(left, signal.SIGKILL)
-    if number == signal.SIGINT:  # of a kill Python's own tracker of resources may tell
+    if number == signal.SIGINT:  # Python's resource tracker may report a kill
         (said,) = words.read_text().splitlines()
         assert "--resume" in said
     with ResultStore.open(out / "results.duckdb") as store:
@@ -209,7 +210,7 @@ def wait_until(ready):
 
 
 def test_a_worker_that_dies_as_it_begins_is_one_line(tmp_path):
-    """What is installed may end a process that imports it; memory that runs out does the same."""
+    """An installed module may end a process that imports it, as may a lack of memory."""
     (tmp_path / "p.toml").write_text(ENDLESS)
     (tmp_path / "sitecustomize.py").write_text("import os, sys\nif '--multiprocessing-fork' in sys.argv: os._exit(9)\n")
     env = os.environ | {"PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}

@@ -1,4 +1,4 @@
-"""Sweeps: the same results whoever does the work, whatever dies on the way, and nothing twice."""
+"""Sweeps: equal results with any workers, also after faults, and no run twice."""
 
 import csv
 import importlib
@@ -83,7 +83,7 @@ def test_results_are_rows_with_settings_versions_and_outcomes(alone):
     assert loud > quiet
 
 
-def test_what_fails_is_a_row_and_the_rest_goes_on(tmp_path):
+def test_failed_runs_are_rows_and_others_continue(tmp_path):
     text = HEAD + 'ranges = 100\n[vary]\n"ranging.rate_hz" = [50.0, 99999.0]\n'
     summary = run_sweep(plan(tmp_path, text), tmp_path / "out", workers=1)
     assert (summary.done, summary.failed) == (2, 1)
@@ -99,7 +99,7 @@ def test_a_process_that_dies_is_replaced_and_several_give_the_same_bytes(alone, 
 
     class Fragile(Processes):
         def submit(self, chunk):
-            # One of the first pool dies, and one of the pool that replaces it: how many chunks there are varies.
+            # A process of the first pool ends, and one of the pool that replaces it: the number of chunks varies.
             super().submit(chunk)
             if self._pool not in pools and len(pools) < 2:
                 pools.append(self._pool)
@@ -121,7 +121,7 @@ def test_a_chunk_that_a_broken_pool_never_reports_is_done_again(alone, tmp_path,
         def submit(self, chunk):
             super().submit(chunk)
             if self.silent is None:
-                # As in the race: the pool knows nothing of the chunk, and breaks.
+                # As in the race condition: the pool does not know the chunk, and breaks.
                 (last,) = self._running
                 self.silent = Future()
                 self._running = {self.silent: self._running[last]}
@@ -189,7 +189,7 @@ def delay_weights(spans):
 
 @pytest.fixture
 def stranger(tmp_path, monkeypatch):
-    """A module of somebody else, which other processes of this machine find on the same path."""
+    """A module of a user, which other processes of this computer find on the same path."""
     folder = tmp_path / "elsewhere"
     folder.mkdir()
     (folder / "stranger.py").write_text(STRANGER)
@@ -225,7 +225,7 @@ def test_functions_of_a_stranger_reach_other_processes(tmp_path, stranger):
     np.testing.assert_allclose(np.subtract(before, after), 3.0, atol=0.03)
 
 
-def test_what_it_raises_fails_its_run_only(tmp_path, stranger):
+def test_errors_of_functions_fail_only_their_run(tmp_path, stranger):
     summary = run_sweep(plan(tmp_path, CALIBRATE), tmp_path / "out", workers=1, evaluate=stranger.failing)
     assert (summary.done, summary.failed) == (2, 2)
     assert {row["error"] for row in rows(tmp_path / "out")} == {"'no such figure'"}
@@ -298,6 +298,6 @@ def test_a_scheduler_that_does_not_answer_is_named(alone, tmp_path, monkeypatch)
         (HEAD + 'design = "latin-hypercube"\n[vary]\n"ranging.rate_hz" = { low = 5, high = 1 }\n', "low below high"),
     ],
 )
-def test_plans_that_cannot_be(tmp_path, text, fragment):
+def test_wrong_sweeps_are_refused(tmp_path, text, fragment):
     with pytest.raises(ScenarioError, match=one_line(fragment)):
         plan(tmp_path, text)

@@ -1,7 +1,7 @@
-"""The twin of a flight that nobody here made: one of MILUV among obstacles, with the calibration published with it.
+"""The twin of a flight of another group: MILUV among obstacles, with its published calibration.
 
-317 exchanges of 48 pairs in 78 s. Tolerances are those asked of a twin: 10 % of medians and 90 % quantiles, 0.1 of
-autocorrelations; powers in dB, of which 10 % would say nothing. What is not met stands in docs/accuracy.md.
+317 exchanges of 48 pairs in 78 s. Tolerances are those required of a twin: 10 % of medians and 90 % quantiles, 0.1 of
+autocorrelations; powers in dB. docs/accuracy.md lists those that are not met.
 """
 
 import numpy as np
@@ -48,8 +48,8 @@ def sides(compared, name):
 
 def test_residuals_are_those_measured(compared):
     measured, simulated = sides(compared, "residual of calibrated ranges")
-    # The 90 % quantile is 36 cm with a standard error of 5 cm, the median 0.9 cm with one of 0.9 cm: the same flight
-    # again would miss ten per cent of them.
+    # The 90 % quantile is 36 cm with a standard error of 5 cm, the median 0.9 cm with one of 0.9 cm: a repetition of
+    # the flight would not meet ten per cent.
     assert simulated.high == pytest.approx(measured.high, abs=0.05)
     assert simulated.median == pytest.approx(measured.median, abs=0.015)
     assert simulated.lag1 == pytest.approx(measured.lag1, abs=0.1)
@@ -70,22 +70,22 @@ def test_powers_are_those_measured(compared):
 
 
 def test_readings_end_where_those_of_the_chip_do(compared):
-    """Readings of these boards end at -80 dBm; those of the twin do, too, within half a decibel."""
+    """Readings of these boards end at -80 dBm, and those of the twin within half a decibel of that."""
     twin, quantities = compared
     assert twin.scenario.radio.saturation_dbm == pytest.approx(-80.0, abs=0.5)
     measured, simulated = quantities["first-path power at initiator"].drawn
     assert simulated.max() == pytest.approx(measured.max(), abs=0.5)
 
 
-def test_alike_is_said_only_where_a_difference_would_have_shown(compared):
-    """Carrier readings last: 317 are worth some 50, which do not show a difference of 0.2."""
+def test_alike_requires_a_detectable_difference(compared):
+    """Carrier readings are persistent: 317 count as 50 independent ones, which do not show a difference of 0.2."""
     one = compared[1]["carrier reading at initiator"]
     assert one.measured.worth < 100
     assert one.detectable > 0.2
     assert one.verdict == "too few"
 
 
-def test_robots_warm_up_and_it_is_seen(compared):
+def test_warm_up_of_robots_is_found(compared):
     """Clocks of flying robots change by up to 4 ppm in the first 40 s; those of anchors hardly do."""
     twin = compared[0]
     assert twin.found["warm_up_s"] is not None
@@ -96,7 +96,7 @@ def test_robots_warm_up_and_it_is_seen(compared):
     assert np.ptp(change[~flying]) < 1.0
 
 
-def test_what_such_a_flight_cannot_tell_is_said(compared):
+def test_undetermined_properties_of_a_real_flight_are_listed(compared):
     words = " ".join(compared[0].unknown)
     assert "(life_s): a pair ranges every" in words
     assert "The difference of -0.11 ppm between dt64/dt53 and the carrier readings" in words

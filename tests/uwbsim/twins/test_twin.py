@@ -1,4 +1,4 @@
-"""A twin of a simulated recording finds what was planted, can be saved, and refuses what has none."""
+"""A twin of a simulated recording has the planted values and can be saved; other recordings are refused."""
 
 import json
 from dataclasses import replace
@@ -35,14 +35,14 @@ def centred(values):
 
 
 def test_broadcasts_have_no_twin():
-    """Their replies wait for slots, for longer than boards can."""
+    """Their replies wait for slots, longer than boards can."""
     flight = uwbsim.simulate(uwbsim.load("broadcast", {"run.duration_s": 3.0}))
     with pytest.raises(uwbsim.ScenarioError, match=r"reply delays of 30\.\d ms.*broadcasts"):
         uwbsim.twin(flight, known(world()))
 
 
 def test_rates_and_noises_are_found(found):
-    """2250 ratios with 0.12 ppm each tell a rate to some 4e-3 ppm, and noise to 1.5 %."""
+    """2250 ratios with 0.12 ppm each determine a rate to 4e-3 ppm, and noise to 1.5 %."""
     planted = [tag["skew_ppm"] for tag in world()["tags"]]
     assert centred([tag.skew_ppm for tag in found.scenario.tags]) == pytest.approx(centred(planted), abs=0.01)
     assert [tag.tx_power_db for tag in found.scenario.tags] == pytest.approx([0.0] * 3, abs=0.3)
@@ -51,11 +51,12 @@ def test_rates_and_noises_are_found(found):
 @pytest.mark.parametrize(
     ("name", "planted"),
     [
-        # Whole ticks add their twelfth to the noise of stamps.
+        # Whole ticks add the variance 1/12 to the noise of stamps.
         ("receive_noise_ps", pytest.approx(np.hypot(95.0, 15.65 / np.sqrt(12)), rel=0.05)),
         ("carrier_noise_ppm", pytest.approx(0.2, rel=0.05)),
         ("carrier_bias_ppm", pytest.approx(-0.13, abs=0.01)),
-        # Three pairs are drawn anew every 0.25 s, 720 times in all, with a share of 0.2: 1.5 points of chance.
+        # Three pairs are drawn again every 0.25 s, 720 times in all, with a share of 0.2: a standard error of 1.5
+        # points.
         ("reflected_share", pytest.approx(0.2, abs=0.02)),
         ("reflection_life_s", pytest.approx(0.25, rel=0.2)),
         ("mean_excess_m", pytest.approx(0.45, rel=0.2)),
@@ -63,7 +64,7 @@ def test_rates_and_noises_are_found(found):
         ("mean_delay_ns", pytest.approx(0.0, abs=0.01)),
         ("direct_std_m", pytest.approx(0.0, abs=0.01)),
         ("path_loss_exponent", pytest.approx(2.4, abs=0.1)),
-        # Which ranges are reflected is not known for certain, and what is not known looks like fading.
+        # Which ranges are reflected is uncertain, and this uncertainty has the effect of fading.
         ("fading_db", pytest.approx(0.0, abs=0.4)),
     ],
 )
@@ -91,14 +92,14 @@ def test_a_saved_twin_flies_the_same_ways(found, flight, tmp_path):
     found.save(tmp_path / "t.toml")
     again = uwbsim.simulate(tmp_path / "t.toml", contention=False)
     assert len(again.exchanges) == len(flight.exchanges)
-    # Poses of a motion capture at 100 Hz lie 1.5 cm apart; between them a cubic is followed.
+    # Poses of motion capture at 100 Hz are 1.5 cm apart; between them a cubic is followed.
     assert np.max(np.abs(again.truth_m - flight.truth_m)) < 1e-3
     with pytest.raises(UwblinkError, match="already exists"):
         found.save(tmp_path / "t.toml")
 
 
 def test_exchanges_that_were_logged_together_do_not_collide(tmp_path):
-    """Lines of a log that come every 30 ms have one time; none of the exchanges was lost."""
+    """Lines of a log that come every 30 ms have one time; no exchange is lost."""
     flight = uwbsim.simulate(world(12.0))
     assert not flight.faults
     times = -(-flight.exchanges.time_ns // 30_000_000) * 30_000_000
@@ -118,8 +119,8 @@ def test_a_twin_of_a_twin_is_alike(compared):
     assert compared["reply dt32"].to_dict()["probability"] > 0.01
 
 
-def test_what_persists_differently_is_not_alike(found):
-    """The same values at other instants: their distribution is alike, their autocorrelation is not."""
+def test_different_persistence_is_not_alike(found):
+    """The same values at other times: their distribution is equal, their autocorrelation is not."""
     shuffled = np.random.default_rng(4).permutation(len(found.measured))
     moved = replace(found.measured, residual_m=found.measured.residual_m[shuffled])
     one = {c.name: c for c in replace(found, measured=moved).compare(1)}["residual of calibrated ranges"]
@@ -158,7 +159,7 @@ def test_recordings_without_a_twin(flight, what):
         uwbsim.twin(change(flight), known(world()))
 
 
-def test_a_recording_that_says_too_little_ends_with_status_1(tmp_path):
+def test_insufficient_recordings_have_status_1(tmp_path):
     uwbsim.simulate(uwbsim.load("noiseless", {"run.duration_s": 0.2})).save(tmp_path / "short.uwb")
     (tmp_path / "c.json").write_text(json.dumps(known(world())))
     words = ("uwbsim", "twin", "short.uwb", "-c", "c.json", "-o", "twin.toml")
@@ -204,7 +205,7 @@ def test_calibrations_without_a_twin_are_refused_by_place(flight, change, place)
         uwbsim.twin(flight, known(world()) | change)
 
 
-def test_nothing_is_written_where_something_is_wrong(flight, tmp_path):
+def test_twins_with_errors_write_no_files(flight, tmp_path):
     flight.save(tmp_path / "f.uwb")
     (tmp_path / "c.json").write_text("{}")
     (tmp_path / "t.html").write_text("mine")
@@ -224,14 +225,13 @@ def test_a_terminal_of_80_columns_loses_no_figure(compared, capsys, monkeypatch)
     assert {word for word in words if word[-1].isdigit() and "/" not in word} <= printed
 
 
-# Share, length and life of reflections, on residuals by a generator of this file, which shares nothing with any model.
-#
-# States alternate: a pair is direct for a while and reflected for a while, whiles are drawn from gamma distributions of
-# shape two (nobody draws anything anew at random instants), and within a while the detour is not constant but breathes.
+# Share, length and duration of reflections, with residuals of a generator in this file, which shares no code with
+# models. States alternate: a pair is direct for some time and reflected for some time, with durations from gamma
+# distributions of shape two (the models draw again at random times), and the detour oscillates within a state.
 
 
 def alternating(rng, time_s, direct_s, reflected_s):
-    """Return which times are reflected, and how far into which spell they are."""
+    """Return a mask of reflected times, and their relative position within the state."""
     begins, reflected, at = [], [], -10 * (direct_s + reflected_s)
     while at < time_s[-1]:
         begins.append(at)
@@ -273,12 +273,12 @@ def reflected_flight(time_s, pair, error):
 
 @pytest.fixture(scope="module")
 def made():
-    """Six pairs: two that are reflected often, and four that are less."""
+    """Six pairs: two that are often reflected, and four that are less."""
     return several(77, [(1.2, 0.6), (1.2, 0.6), (3.0, 0.5), (3.0, 0.5), (4.0, 0.4), (4.0, 0.4)])
 
 
 def several(seed, whiles):
-    """Return a flight of pairs at 20 Hz each for 300 s, which ranges are reflected, and the mean shares of pairs."""
+    """Return a flight of pairs at 20 Hz each for 300 s, a mask of reflected ranges, and the mean shares of pairs."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(0, 300, 0.05)
     parts = [residuals(rng, time_s + 0.005 * k, *pair) for k, pair in enumerate(whiles)]
@@ -295,7 +295,7 @@ def reflected_found(made):
 
 
 def test_shares_are_found_of_all_and_of_pairs(made, reflected_found):
-    """The flight's own shares, which a pair's 60 to 170 spells leave 3 points from those that were asked for."""
+    """The shares of the flight itself; with 60 to 170 spells per pair, they are 3 points from the requested ones."""
     whole, state, asked = made
     assert reflected_found.share == pytest.approx(np.mean(state), abs=0.02)
     own = [np.mean(state[whole.pair == k]) for k in range(6)]
@@ -307,8 +307,8 @@ def test_shares_are_found_of_all_and_of_pairs(made, reflected_found):
     assert np.mean(list(reflected_found.delays_ns.values())) == pytest.approx(0.0, abs=0.02)
 
 
-def test_the_life_is_that_of_the_states(made, reflected_found):
-    """The states' own integral of the autocorrelation, which no fit and no drawing at random instants is in."""
+def test_durations_are_those_of_the_states(made, reflected_found):
+    """The integral of the states' autocorrelation, without a fit and without a model of random redraws."""
     whole, state, _ = made
     pairs = [state[whole.pair == k].astype(float) for k in range(6)]
     lives = [integral_s(one - one.mean(), 0.05) for one in pairs]
@@ -342,15 +342,15 @@ def test_some_rows_are_of_all_pairs_that_take_turns():
 
 
 def autoregressive(steps, keep):
-    """Each value is the share `keep` of the one before it, and a step that leaves the variance at one."""
+    """Return a sequence in which each value is `keep` times the previous one plus a step, with a variance of one."""
     values, now = np.empty(len(steps)), 0.0
     for k, (share, step) in enumerate(zip(keep, steps, strict=True)):
         values[k] = now = share * now + np.sqrt(1 - share**2) * step
     return values
 
 
-def test_values_are_worth_what_their_dependence_leaves():
-    """An autoregressive sequence of coefficient a is worth (1 - a)/(1 + a) of its length."""
+def test_effective_sizes_agree_with_theory():
+    """An autoregressive sequence with the coefficient a has (1 - a)/(1 + a) of its length in independent values."""
     value, group = autoregressive(np.random.default_rng(3).normal(size=60_000), [0.8] * 60_000), np.zeros(60_000, int)
     assert effective_size(value, group) / 60_000 == pytest.approx(0.2 / 1.8, rel=0.1)
     r, error = lag_one(value, group)
@@ -359,11 +359,11 @@ def test_values_are_worth_what_their_dependence_leaves():
     assert error == pytest.approx(np.sqrt((1 - 0.8**2) / 60_000), rel=0.15)
 
 
-# Twins of worlds with anchors, antennas of tags, fading, losses in bursts, plans of other kinds and two messages.
+# Twins of worlds with anchors, antennas of tags, fading, bursts of losses, other plans and two messages.
 
 
 def antennas():
-    """Two robots and an anchor; along x one tag has more gain, another sends weak, and a third reads strong."""
+    """Two robots and an anchor; one tag has more gain along x, another transmits weakly, and a third reads high."""
     bodies = [
         {"name": "a", "motion": box(-2.0, -2.0)},
         {"name": "b", "motion": box(2.0, 1.5)},
@@ -393,7 +393,7 @@ def other_found():
 
 @pytest.mark.slow
 def test_antennas_and_offsets_are_told_apart(other_found):
-    """Differences of directions are told by every exchange; of an antenna, fading leaves half a decibel open."""
+    """Every exchange determines differences of directions; for an antenna, fading leaves half a decibel."""
     tags = {tag.id: tag for tag in other_found.scenario.tags}
     own = np.array(tags[1].pattern_db[1:])
     assert own[2] == pytest.approx(2.0, abs=0.6)
@@ -430,7 +430,7 @@ def test_readings_that_saturate_are_told_from_powers_that_end():
     assert saturated.found["path_loss_exponent"] == pytest.approx(2.4, abs=0.2)
 
 
-def test_a_mast_stands_and_robots_fly_as_recorded(other_found):
+def test_masts_are_static_and_robots_fly_as_recorded(other_found):
     motions = {body.name: body.motion for body in other_found.scenario.bodies}
     assert [motion.model for motion in motions.values()] == ["recorded", "recorded", "static"]
     assert motions["mast"].position_m == pytest.approx((-1.5, 3.0, 2.5))
@@ -450,5 +450,5 @@ def test_two_messages_at_random_times_have_a_plan_and_no_noise_of_stamps(tmp_pat
     again = uwbsim.simulate(tmp_path / "t.toml", contention=False).exchanges
     assert len(again) == len(flight.exchanges)
     assert np.array_equal(again.target, flight.exchanges.target)
-    # Slots begin where messages left: a preamble later.
+    # Slots start when messages were sent: a preamble later.
     assert np.max(np.abs(np.diff(again.time_ns) - np.diff(flight.exchanges.time_ns))) < 2_000

@@ -1,4 +1,4 @@
-"""Flights to make twins of, and the calibrations that know their devices."""
+"""Flights for twins, and calibrations with the planted values of their devices."""
 
 from typing import Any
 
@@ -38,7 +38,7 @@ def world(duration_s=60.0, seed=5, rate_hz=150.0, radio=None, **more):
 
 
 def known(scenario):
-    """What a calibration that found everything says, as its JSON."""
+    """Return a calibration with the planted values, as JSON."""
     planted = uwbsim.load(scenario).planted()
     curve: dict[str, Any] = planted["bias_curve"] or LINE
     shape = curve | {"range": [curve["knots"][0], curve["knots"][-1]]}

@@ -1,4 +1,4 @@
-"""What several tests of the world measure alike."""
+"""Measurements that several tests of the world share."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from uwblink.wire.messages import REPORTS, Overheard
 
 
 def served(world):
-    """Range once from tag 1 to tag 2; return what the initiator and the listener, tag 3, print."""
+    """Range once from tag 1 to tag 2; return the output of the initiator and of the listener, tag 3."""
     ports = uwbsim.VirtualPorts(world)
     Board(ports.port(3)).set_passive(True)
     report = Board(ports.port(1)).range(2)

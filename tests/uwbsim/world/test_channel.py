@@ -36,12 +36,12 @@ def link(world, now=5_000_000):
 
 
 def sampled(world, now=5_000_000):
-    """The same link with all its paths."""
+    """Return the same link with all its paths."""
     return SampledWorld(World(world)).from_sender(0, now)[ONE]
 
 
 def paths(world, detour_m=0.0):
-    """The paths of the first link at the start, as a response shows them."""
+    """Return the paths of the first link at the start, as in a response."""
     (found,) = World(world).paths(ZERO, ONE, ZERO, np.array([detour_m]))
     return found
 
@@ -78,7 +78,7 @@ def test_reflections_have_the_lengths_of_their_two_legs():
 
 
 def test_echoes_have_the_gains_of_their_own_directions():
-    """One dipole above the other: the direct path lies in both nulls, the way by a wall does not."""
+    """One dipole above the other: the direct path is in both nulls, the path by a wall is not."""
     found = sampled(scenario(places=((0.0, 0.0, 0.5), (0.0, 0.0, 2.5)), room=ROOM, radio={"antenna": "dipole"}))
     assert found.paths_dbm[0, 0] == pytest.approx(-70 - 20 * np.log10(2) + 2 * (1.76 - 20), abs=1e-9)
     wall = np.hypot(2, 8)  # by the wall at x = -4 m; the sine to the axis is 8/hypot(2, 8)
@@ -90,7 +90,7 @@ def test_echoes_have_the_gains_of_their_own_directions():
 def test_echoes_go_through_obstacles_and_bodies_as_the_direct_path_does():
     plate = {"min_m": [-4.0, -4.0, 0.4], "max_m": [8.0, 4.0, 0.5], "material": {"loss_db_per_m": 100.0, "index": 2.0}}
     free, covered = (sampled(scenario(room=ROOM, **more)) for more in ({}, {"obstacles": [plate]}))
-    # The way by the floor crosses the plate twice, 0.1 m times 4.47/2 each.
+    # The path by the floor crosses the plate twice, 0.1 m times 4.47/2 each.
     crossed = 2 * 0.1 * np.hypot(4, 2) / 2
     assert free.paths_dbm[0, 5] - covered.paths_dbm[0, 5] == pytest.approx(100 * crossed, abs=1e-9)
     assert covered.paths_m[0, 5] - free.paths_m[0, 5] == pytest.approx(crossed, abs=1e-9)
@@ -104,25 +104,25 @@ def test_echoes_go_through_obstacles_and_bodies_as_the_direct_path_does():
 
 @pytest.mark.parametrize("at_1m_dbm", [-70.0, -76.0, -82.0])
 def test_impulse_responses_follow_the_power_of_the_link(at_1m_dbm):
-    """The chip's own formula, applied to the taps that it prints, gives the first-path power (User Manual, 4.7.1)."""
+    """The formula of the chip, applied to the printed taps, gives the first-path power (User Manual, 4.7.1)."""
     flight = uwbsim.simulate(scenario(radio={"first_path_at_1m_dbm": at_1m_dbm}))
     found = []
     for row in flight.cirs:
         after = np.floor(row.first_path_index).astype(int) + np.arange(1, 4)
         squares = np.sum(np.array(row.magnitudes, dtype=float)[after] ** 2)
         found.append(10 * np.log10(squares / 118**2) - 121.74)
-    # Diffuse paths, the firmware's estimate of magnitudes and where the taps lie scatter it.
+    # Diffuse paths, the firmware's estimate of magnitudes and the positions of the taps cause scatter.
     assert np.median(found) == pytest.approx(flight.exchanges.fpp2_dbm[0], abs=1.5)
 
 
 def test_a_ranges_own_detour_brings_its_echoes_nearer():
-    """With a detour of the first path, what comes after comes sooner after it."""
+    """With a detour of the first path, echoes come sooner after it."""
     plain, late = (paths(scenario(room=ROOM), detour_m) for detour_m in (0.0, 0.3))
     assert late.delay_s[0] == pytest.approx(plain.delay_s[0] - 0.3 / SPEED_OF_LIGHT)
     room = ROOM | {"max_m": [8.0, 4.0, 40.0], "min_m": [-60.0, -60.0, -0.5], "reflection_loss_db": 0.0}
     flight = uwbsim.simulate(scenario(room=room, radio={"multipath": {"probability": 1.0, "mean_excess_m": 0.2}}))
     excess = raw_range(flight.exchanges) - flight.truth_m
-    way = 3.0  # by the floor, 1.5 m below, 5 m instead of 4 m
+    way = 3.0  # by the floor, 1.5 m below: 5 m instead of 4 m
     for row, own in zip(flight.cirs, excess.tolist(), strict=True):
         taps, peak = np.array(row.magnitudes), row.first_path_index + EDGE_TO_PEAK
         echo = peak + (np.hypot(4, way) - 4.0 - own) / SPEED_OF_LIGHT / TAP_S
@@ -133,7 +133,7 @@ def test_a_ranges_own_detour_brings_its_echoes_nearer():
 def test_tags_may_send_stronger_and_read_too_high():
     world = scenario(tags=({"tx_power_db": 3.0}, {"power_offset_db": -1.5}))
     plain, flight = uwbsim.simulate(scenario()), uwbsim.simulate(world)
-    # The poll is sent by tag 1 and read by tag 2; the response the other way round.
+    # Tag 1 sends the poll and tag 2 reads it; the response is the other way round.
     np.testing.assert_allclose(flight.exchanges.fpp1_dbm - plain.exchanges.fpp1_dbm, 3.0 - 1.5, atol=1e-9)
     np.testing.assert_allclose(flight.exchanges.fpp2_dbm, plain.exchanges.fpp2_dbm, atol=1e-9)
     report = Board(uwbsim.VirtualPorts(world).port(1)).range(2)
@@ -141,7 +141,7 @@ def test_tags_may_send_stronger_and_read_too_high():
     assert (report.fpp1_dbm, report.fpp2_dbm) == pytest.approx((x.fpp1_dbm[0], x.fpp2_dbm[0]), abs=2e-4)
 
 
-def test_who_sends_weakly_is_not_heard():
+def test_weak_transmitters_are_not_received():
     radio = {"sensitivity_dbm": -85.0, "power_noise_db": 0.0}
     weak = {"tx_power_db": -10.0}
     for place, tags in enumerate([(weak, {}), ({}, weak)]):
@@ -166,7 +166,7 @@ def still_flight(radio, second=None, duration_s=400.0, **ranging):
     )
 
 
-def test_fading_has_the_spread_and_the_life_that_were_asked_for():
+def test_fading_has_the_set_spread_and_lifetime():
     x = still_flight({"fading": {"std_db": 2.0, "life_s": 0.1}}).exchanges
     # 4000 draws: the standard error of the spread is 1.1 %, that of an autocorrelation 0.02.
     assert np.std(x.fpp1_dbm) == pytest.approx(2.0, rel=0.05)
@@ -187,7 +187,7 @@ def test_a_tag_has_an_antenna_of_its_own():
     coefficients = (0.5, 0.0, 0.0, 2.0)  # everywhere, and along x by sqrt(3) times the cosine
     x = still_flight({}, {"pattern_db": coefficients}, duration_s=0.1).exchanges
     bare = still_flight({}, duration_s=0.1).exchanges
-    # From the second tag the first is in the direction (-0.6, -0.8, 0).
+    # From the second tag, the first is in the direction (-0.6, -0.8, 0).
     assert x.fpp1_dbm - bare.fpp1_dbm == pytest.approx(0.5 - 0.6 * 2 * np.sqrt(3))
     assert x.fpp2_dbm - bare.fpp2_dbm == pytest.approx(0.5 - 0.6 * 2 * np.sqrt(3))
 
@@ -203,7 +203,7 @@ def test_replies_follow_the_quantiles_that_are_given():
     table = [300.0, 301.0, 305.0, 400.0]
     x = still_flight({}, reply={"model": "quantiles", "delays_us": table}).exchanges
     dt32_us = np.asarray((x.tx2 - x.rx1) % 2**32) / 63897.6
-    # Replies leave at the next multiple of 8 ns.
+    # Replies are sent at the next multiple of 8 ns.
     assert np.quantile(dt32_us, [0, 1 / 3, 2 / 3, 1]) == pytest.approx(table, rel=0.01)
     with pytest.raises(uwbsim.ScenarioError, match=r"reply.delays_us: .* must not decrease"):
         still_flight({}, reply={"model": "quantiles", "delays_us": [302.0, 301.0]})
@@ -221,7 +221,7 @@ def error_of(run):
     return raw_range(run.exchanges) - run.truth_m
 
 
-# What a chip reads off a response: against paths summed here, and geometry by hand.
+# Readings of a chip from a response, compared with sums of paths here, and with geometry by hand.
 
 
 SENSING = (Radio(dynamic_range_db=15.0, sensitivity_dbm=-105.0), 1 / 12)
@@ -229,7 +229,7 @@ WIDTH_TAPS, EDGE_TAPS = 1.2, 1.5
 
 
 def arrivals(*ways):
-    """One link with ways (detour in metres, power in dBm, phase)."""
+    """Return one link with paths (detour in metres, power in dBm, phase)."""
     detour, power, phase = np.array(ways).T
     return Paths(detour_m=detour[None], amplitude=(10 ** (power / 20) * np.exp(1j * phase))[None])
 
@@ -246,7 +246,7 @@ def test_responses_are_sums_of_pulses():
         for link in zip(detour, amplitude, strict=True)
     ]
     real, imaginary = accumulate(Paths(detour_m=detour, amplitude=amplitude))
-    # Paths lie on a 128th of a tap.
+    # Paths are at multiples of a 128th of a tap.
     np.testing.assert_allclose(real + 1j * imaginary, expected, atol=0.04)
 
 
@@ -261,7 +261,7 @@ def test_a_path_alone_is_found_where_it_is_with_the_power_that_it_has(power_dbm)
 def test_a_direct_path_counts_down_to_the_threshold_and_no_further(below_db, first):
     """The reflection by a wall 3 m beside two antennas 4 m apart takes 7.2 m.
 
-    Taps lie up to half a tap beside a peak, where it has 1.5 dB less: so near to the threshold either may be.
+    Taps may be half a tap beside a peak, where it has 1.5 dB less: near the threshold, either result is possible.
     """
     detour = np.hypot(4.0, 6.0) - 4.0
     found = detect(arrivals((0.0, -80.0 - below_db, 0.0), (detour, -80.0, 1.0)), *SENSING)
@@ -271,7 +271,7 @@ def test_a_direct_path_counts_down_to_the_threshold_and_no_further(below_db, fir
     assert found.total_dbm[0] == pytest.approx(-80.0 + 10 * np.log10(1 + 10 ** (-below_db / 10)), abs=0.05)
 
 
-def test_what_is_below_sensitivity_is_no_first_path():
+def test_paths_below_sensitivity_are_no_first_paths():
     weak = arrivals((0.0, -106.0, 0.0), (2.0, -98.0, 0.0))
     assert detect(weak, *SENSING).excess_m[0] == pytest.approx(2.0, abs=0.005)
     keener = Radio(dynamic_range_db=15.0, sensitivity_dbm=-108.0)
@@ -289,22 +289,22 @@ def test_paths_nearer_than_the_pulse_fade_by_their_phase():
 
 
 def test_noise_of_the_edge_is_that_of_a_crossing_at_half_height():
-    """Draw noise on the edge, find the crossing again: its spread is what was said. The peak's height is known."""
+    """Draw noise on the edge and find the crossing again: its spread is as predicted, for a known peak height."""
     rng = np.random.default_rng(4)
     for power_dbm in (-85.0, -97.0):
         said = detect(arrivals((0.0, power_dbm, 0.0)), *SENSING).noise_s[0]
         peak = 10 ** (power_dbm / 20)
-        # The strongest taps lie half a tap beside the peak.
+        # The strongest taps are half a tap beside the peak.
         threshold = max(peak * np.exp(-((0.5 / WIDTH_TAPS) ** 2)) * 10 ** (-15 / 20), 10 ** (-105 / 20))
         taps = np.linspace(-4, 0, 4001)
-        # The noise hardly changes along the edge: in phase with the pulse it moves it up and down.
+        # The noise is nearly constant along the edge: in phase with the pulse it moves it up and down.
         noise = rng.normal(0, threshold / 12, 4000)
         crossing = np.interp(peak / 2 - noise, peak * np.exp(-((taps / WIDTH_TAPS) ** 2)), taps)
         assert said == pytest.approx(np.std(crossing) * 1.0016e-9, rel=0.05)
 
 
 def test_the_edge_is_at_half_the_height_of_the_first_peak():
-    """A weaker path runs into a stronger one: the half height is found here on a fine grid."""
+    """A weaker path overlaps with a stronger one: the half height is found here on a fine grid."""
     ways = arrivals((0.0, -84.0, 0.0), (0.35, -80.0, 0.6))
     detour, amplitude = ways.detour_m[0] / TAP_M, ways.amplitude[0]
     taps = np.linspace(-4, 6, 100_001)
@@ -315,15 +315,15 @@ def test_the_edge_is_at_half_the_height_of_the_first_peak():
     assert 0.05 < expected < 0.35
 
 
-# Reflections that last: planted shares and lives by pair, and their trace, wherever frames are received.
+# Reflections that last: planted shares and durations by pair, and their effects, wherever frames are received.
 
 
 PLACES = {"a": (0.0, 0.0, 1.0), "b": (4.0, 0.5, 1.2), "c": (1.5, 3.0, 0.8)}
 EXPECTED = {(1, 2): (0.1, 0.3), (1, 3): (0.5, 1.0), (2, 3): (0.3, 0.5)}
-"""Share and life in seconds of each pair; those of the last are the model's."""
+"""Share and duration in seconds of each pair; those of the last are the model's."""
 
 FIRST_DB, TOTAL_DB = 9.0, 2.5
-# A gamma of shape 8 has no excess so small that it could be taken for none.
+# A gamma distribution of shape 8 has practically no excess near zero.
 MODEL = {
     "model": "two-state",
     "share": 0.3,
@@ -367,7 +367,7 @@ def long_flight():
 def test_pairs_have_their_own_shares(long_flight, pair):
     share, life_s = EXPECTED[pair]
     reflected = by_pair(long_flight, pair)[1] > 0.1
-    # An hour holds 3600/(2 life) independent looks.
+    # An hour has 3600/(2 life) independent samples.
     assert np.mean(reflected) == pytest.approx(share, abs=3 * np.sqrt(share * (1 - share) * 2 * life_s / 3600))
 
 
@@ -376,7 +376,7 @@ def test_residuals_and_states_forget_with_their_life(long_flight, pair):
     life_s, residual = EXPECTED[pair][1], by_pair(long_flight, pair)[1]
     for lag in (1, 4, 10, 20):
         expected = np.exp(-lag * 0.05 / life_s)
-        # A thousandth of the hour each: autocorrelations are known to 0.03.
+        # Lags of a thousandth of the hour: autocorrelations are known to 0.03.
         assert autocorrelation(residual, lag) == pytest.approx(expected, abs=0.08), lag
         assert autocorrelation((residual > 0.1).astype(float), lag) == pytest.approx(expected, abs=0.08), lag
 
@@ -387,14 +387,14 @@ def test_reflections_show_in_first_path_power(long_flight):
     for name in ("fpp1_dbm", "fpp2_dbm"):
         power = getattr(long_flight.exchanges, name)[rows]
         assert np.ptp(power[~reflected]) < 1e-9
-        # An exchange in the middle of which the path changes has one power of each.
+        # If the path changes during an exchange, it has one power of each state.
         assert np.median(power[~reflected]) - np.median(power[reflected]) == pytest.approx(FIRST_DB, abs=1e-9)
 
 
 def test_excess_is_that_of_the_scenario(long_flight):
     residual = by_pair(long_flight, (2, 3))[1]
     excess = residual[residual > 0.1]
-    # 2000 reflections of a shape of 8 know their mean to 1 %.
+    # 2000 reflections of a shape of 8 determine their mean to 1 %.
     assert excess.mean() == pytest.approx(0.8, rel=0.04)
     assert excess.std() == pytest.approx(0.8 / np.sqrt(8), rel=0.08)
 
@@ -417,7 +417,7 @@ def test_the_workbench_counts_them_as_errors():
     assert found.pooled()[0] == pytest.approx(np.mean(raw_range(flight.exchanges) - flight.truth_m), abs=0.002)
 
 
-def test_pairs_shares_and_lives_spread_as_asked_for():
+def test_shares_and_lifetimes_of_pairs_have_the_set_spread():
     tags = [{"id": k, "body": "ab"[k % 2], "lever_arm_m": [0.1 * k, 0, 0]} for k in range(40)]
     bodies = [{"name": n, "motion": {"model": "static", "position_m": PLACES[n]}} for n in "ab"]
     model = MODEL | {"share": 0.2, "share_std": 0.1, "life_s": 0.05}
@@ -455,6 +455,6 @@ def test_a_longer_run_continues_the_same_reflections():
         ({"life_s": 0.0}, "life_s"),
     ],
 )
-def test_models_that_cannot_be_are_refused(change, fragment):
+def test_wrong_models_are_refused(change, fragment):
     with pytest.raises(uwbsim.ScenarioError, match=fragment):
         states_world(**change)

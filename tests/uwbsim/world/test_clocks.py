@@ -1,4 +1,4 @@
-"""Clocks: reading and its inverse at any hour, and noise as an outside authority measures it (allantools)."""
+"""Clocks: readings and their inverse at any time, and noise as measured by an independent program (allantools)."""
 
 from functools import partial
 
@@ -39,7 +39,7 @@ def subticks(seconds):
 
 
 def ahead_s(clock, time, tag):
-    """By how much a clock is ahead of true time since its start."""
+    """Return by how much a clock is ahead of true time since its start."""
     return (clock.read(np.full(len(time), tag), time) - time - clock.offset[tag]) / SUBTICKS_PER_SECOND
 
 
@@ -68,7 +68,7 @@ def test_noise_depends_neither_on_what_else_is_asked_nor_on_how_long_the_run_is(
     np.testing.assert_array_equal(whole, long.read(tag, time))
 
 
-def test_noisy_clocks_begin_at_their_offset_and_never_stand_still():
+def test_noisy_clocks_begin_at_their_offset_and_always_change():
     c = clocks(clock_offset_s=1.0, **NOISY)
     np.testing.assert_array_equal(c.read(BOTH, np.zeros(2, dtype=np.int64)), c.offset)
     assert (c.offset // SUBTICKS).tolist() == [63_897_600_000] * 2
@@ -83,9 +83,9 @@ def test_drawn_offsets_are_any_reading_of_the_counter_and_any_part_of_a_tick():
     assert len(np.unique(parts)) > 50
 
 
-def test_the_noises_of_two_clocks_have_nothing_to_do_with_each_other():
+def test_the_noises_of_two_clocks_are_independent():
     c, time = clocks(100.0, white_ppm_sqrt_s=0.01, flicker_ppm=0.01), subticks(np.arange(0, 100, 0.001))
-    # 100 000 independent pairs know a correlation to 0.003.
+    # 100,000 independent pairs determine a correlation to 0.003.
     assert abs(np.corrcoef(*(np.diff(ahead_s(c, time, k)) for k in (0, 1)))[0, 1]) < 0.015
 
 
@@ -103,7 +103,7 @@ def test_the_rate_of_a_noisy_clock_is_what_its_reading_gains_over_a_preamble_or_
     assert np.std(found[which == 0]) > 2 / span, "there is noise in it"
 
 
-# For the long ones 20 hours altogether: 240 independent spans of 300 s, known to 5 %.
+# For the long ones, 20 hours altogether: 240 independent spans of 300 s, known to 5 %.
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kinds", "long"), [([kind], long) for kind in NOMINAL for long in (False, True)] + [([*NOMINAL], False)]
@@ -119,7 +119,7 @@ def test_allan_deviations_are_nominal_and_add_up_in_variance(kinds, long):
     np.testing.assert_allclose(np.sqrt(np.mean(squares, axis=0)), expected, rtol=0.10)
 
 
-# Where bodies go, and inertial readings that lead back to it and err as their grade says.
+# Motion of bodies, and inertial readings that integrate to it, with errors by their grade.
 
 
 FLIGHT = {"model": "random-flight", "box_min_m": [-2, -2, 0.5], "box_max_m": [2, 2, 2.5]}
@@ -212,7 +212,7 @@ def test_figures_pass_through_points_known_by_hand(shape, rounds_a_climb):
     np.testing.assert_allclose(place[:, 0], [0, -half, -2, -half, 0, 2], atol=1e-3)
     sideways = [0, -1, 0, 1, 0, 0] if shape == "eight" else [2, half, 0, -half, -2, 0]
     np.testing.assert_allclose(place[:, 1], sideways, atol=1e-3)
-    # The path is at its middle height at the x axis, from where it climbs.
+    # The path has its middle height at the x axis, and rises from there.
     climbs = np.arange(1, 22) / 4 / rounds_a_climb
     height = at(np.arange(21.0), poses.position_m)[:, 2]
     np.testing.assert_allclose(height, 1.5 + 0.4 * np.sin(2 * np.pi * climbs), atol=1e-3)
@@ -225,7 +225,7 @@ def test_perfect_readings_integrate_to_the_flight():
     time, poses = found.imu["time_ns"] * 1e-9, drone_poses(found)
     turn, place = Rotation.from_quat(poses.quaternion[: len(time)]), poses.position_m[: len(time)]
     assert np.array_equal(poses.time_ns[: len(time)], found.imu["time_ns"])
-    # Turns: each reading turns half of the way before it and half of that after it.
+    # Rotations: each reading turns by half of the interval before it and half of that after it.
     steps = (columns(found.imu, "w")[1:] + columns(found.imu, "w")[:-1]) / 2 * np.diff(time)[:, None]
     attitude = turn[0]
     for step in steps:
@@ -241,13 +241,13 @@ def test_a_body_at_rest_feels_what_holds_it_up_and_errs_by_its_grade():
     imu = {"rate_hz": 100.0, "gyro_bias_dps": 0.0, "gyro_noise_dps_per_sqrt_hz": 0.02, "vibration_mps2": 0.5}
     found = flown(STILL, 100.0, imu=imu | {"accel_bias_mps2": 0.0, "accel_noise_mps2_per_sqrt_hz": 0.0})
     gyro, force = columns(found.imu, "w"), columns(found.imu, "a")
-    # 10 000 readings: a standard deviation is known to 0.7 %, the slow walk of the bias far below the noise.
+    # 10,000 readings: a standard deviation is known to 0.7 %; the slow walk of the bias is far below the noise.
     assert np.std(np.diff(gyro, axis=0)) / np.sqrt(2) == pytest.approx(np.radians(0.02) * 10, rel=0.03)
     assert force.mean(axis=0) == pytest.approx([0, 0, 9.81], abs=0.05)
     assert np.std(np.diff(force, axis=0)) / np.sqrt(2) == pytest.approx(0.5, rel=0.03)
 
 
-def test_biases_differ_between_seeds_and_are_as_large_as_said():
+def test_biases_differ_between_seeds_and_have_the_set_size():
     imu = {"accel_bias_mps2": 0.2, "rate_hz": 50}
     means = [columns(flown(STILL, 1.0, seed, imu=imu).imu, "a").mean(axis=0) for seed in range(30)]
     assert np.std(np.subtract(means, (0, 0, 9.81))) == pytest.approx(0.2, rel=0.25)

@@ -1,6 +1,6 @@
-"""What boards do as devices: temperature, supply voltage, group delay over direction, and the carrier's reading.
+"""Effects of boards as devices: temperature, supply voltage, group delay over direction, and carrier readings.
 
-What is expected was worked out by hand from what is planted.
+Expected values were computed by hand from the planted ones.
 """
 
 from dataclasses import replace
@@ -23,7 +23,7 @@ WARM = {"model": "warm-up", "start": 23.0, "end": 43.0, "time_constant_s": 5.0}
 
 
 def scenario(tags=({}, {}), bodies=({}, {}), devices=None, places=((0.0, 0.0, 1.0), (4.0, 0.0, 1.0)), **more):
-    """Two tags 4 m apart; 20 ps of noise dither the ticks, the same in every scenario."""
+    """Return two tags 4 m apart; 20 ps of noise dither the ticks, equally in every scenario."""
     quiet = {"rx_noise_ps": 20.0, "skew_noise_ppm": 0.0, "skew_bias_ppm": 0.0}
     return uwbsim.load(
         {
@@ -52,7 +52,7 @@ def errors(world):
 
 
 def test_a_warm_up_of_20_kelvin_lengthens_ranges_by_86_mm():
-    """Two tags times 2.15 mm/K times 20 K, as the heat comes."""
+    """Two tags times 2.15 mm/K times 20 K, with the time course of the heat."""
     cold, warm = (errors(scenario(bodies=[{"temperature_c": t}] * 2, devices=TYPICAL)) for t in (23.0, 43.0))
     # The mean of 1000 ranges with 20 ps and whole ticks is known to 0.1 mm.
     assert np.mean(warm[0]) - np.mean(cold[0]) == pytest.approx(0.086, abs=0.0005)
@@ -88,7 +88,7 @@ def test_served_boards_are_as_warm():
         world = scenario(bodies=[{"temperature_c": celsius}] * 2, devices=TYPICAL)
         board = Board(uwbsim.VirtualPorts(world).port(1))
         found.append(np.mean([board.range(2).range_m for _ in range(20)]))
-    # 200 K, so that 20 ranges with whole ticks of 4.7 mm know it: to 2 mm.
+    # 200 K, so that 20 ranges with whole ticks of 4.7 mm determine it: to 2 mm.
     assert found[1] - found[0] == pytest.approx(0.86, abs=0.004)
 
 
@@ -98,7 +98,7 @@ def test_clocks_run_off_by_the_integral_of_warm_up_and_temperature():
     clocks, which = Clocks.of(scenario(tags=tags)), np.array([0, 1])
     begin, end = (clocks.read(which, np.full(2, t * SUBTICKS_PER_SECOND)) for t in (0, 10))
     gained = (end - begin) / SUBTICKS_PER_SECOND - 10
-    # Rates are constant over tenths of a second, taken in their middles.
+    # Rates are constant over tenths of a second, evaluated in their middles.
     np.testing.assert_allclose(gained, [30e-6 + 8e-6 * (1 - np.exp(-2.5)), 0.5e-6 * (25 + 30)], atol=2e-9)
 
 
@@ -117,7 +117,7 @@ def test_a_profile_from_a_file_and_what_the_recording_tells(tmp_path, monkeypatc
     warm = scenario(bodies=({"temperature_c": 25.0}, {}), devices={"reading_noise_k": 0.1, "readings_hz": 20.0})
     noisy = uwbsim.simulate(warm).temperature
     assert np.isnan(noisy["supply_v"]).all()
-    # 200 readings know a deviation to 5 %.
+    # 200 readings determine a deviation to 5 %.
     assert np.std(noisy["temperature_c"]) == pytest.approx(0.1, rel=0.15)
     assert uwbsim.simulate(scenario()).temperature == {}
 
@@ -132,7 +132,7 @@ WAVES = {"model": "harmonics", "mean_cm": 1.0, "cosine_cm": [2.0, 0.5], "sine_cm
 
 @pytest.mark.parametrize("turned", [0.0, 30.0])
 def test_group_delay_lengthens_ranges_by_both_directions(turned):
-    """From a, b lies at azimuth 30 degrees and elevation 0, from b, a at -150 degrees."""
+    """From a, b is at azimuth 30 degrees and elevation 0; from b, a is at -150 degrees."""
     places = ((0.0, 0.0, 1.0), (4 * np.cos(np.pi / 6), 2.0, 1.0))
     free, late = (errors(scenario(places=places, tags=tags))[0] for tags in (({}, {}), ({"group_delay": WAVES},) * 2))
     flat = 1 + 2 * np.cos(np.pi / 6) + 0.5 * 0.5 + 3 * np.sin(np.pi / 3)
@@ -151,24 +151,24 @@ def test_group_delay_from_a_table_file_for_all(tmp_path, monkeypatch):
     tables = [{"model": "table", "file": "delay.csv", "turned_deg": turned} for turned in (0, 30)]
     places = ((0.0, 0.0, 1.0), (0.0, 4.0, 1.0))
     found = [np.mean(errors(scenario(places=places, radio={"group_delay": table}))[0]) for table in tables]
-    # At 90 and -90 degrees 1.5 and -1.5 cm; turned by 30 at 60 and -120 degrees 1 and -2 cm.
+    # At 90 and -90 degrees 1.5 and -1.5 cm; rotated by 30, at 60 and -120 degrees, 1 and -2 cm.
     assert found[0] - found[1] == pytest.approx(0.01, abs=0.001)
 
 
-def test_the_carrier_has_a_sign_and_a_bias_that_grows_with_power():
+def test_carrier_readings_have_a_sign_and_a_bias_by_power():
     told = []
     for radio in ({}, {"carrier_sign": -1}, {"skew_bias_ppm": 0.1, "skew_bias_ppm_per_db": 0.02}):
         exact = {"quantize": False, "first_path_at_1m_dbm": -80.0}
         flight = uwbsim.simulate(scenario(tags=({"skew_ppm": 5.0}, {"skew_ppm": 2.0}), radio=exact | radio))
         told.append([np.mean(flight.exchanges.skew1_ppm), np.mean(flight.exchanges.skew2_ppm)])
-    # 4 m are 12.04 dB below a metre: -92.04 dBm, 2.04 dB below where the bias is what it is called.
+    # 4 m are 12.04 dB below a metre: -92.04 dBm, 2.04 dB below the power to which the stated bias applies.
     bias = 0.1 - 0.02 * (20 * np.log10(4) - 10)
     np.testing.assert_allclose(told, [[-3, 3], [3, -3], [-3 + bias, 3 + bias]], atol=1e-6)
 
 
 @pytest.mark.parametrize("protocol", ["ss-cfo", "ds", "ds-alt"])
 def test_event_loop_and_monte_carlo_agree_on_all_of_it(protocol):
-    """One flight with everything at once: means of 1000 ranges of either, known to 1 mm each."""
+    """One flight with all effects: means of 1000 ranges each, known to 1 mm."""
     tags = (
         {"skew_ppm": 2.0, "temperature_c": 60.0, "group_delay": WAVES, "tx_power_db": 4.0, "skew_ppm_per_k": 0.01},
         {"supply_v": 3.0, "range_cm_per_v": 20.0},
@@ -182,7 +182,7 @@ def test_event_loop_and_monte_carlo_agree_on_all_of_it(protocol):
 
 
 def test_readings_of_power_saturate():
-    """Inverses of lifted powers, to the power of 1.5, add up with the highest's: weak ones stay, strong ones end."""
+    """Inverses of lifted powers, to the power of 1.5, add to that of the limit: only strong powers saturate."""
     found = []
     for at_1m_dbm in (-100.0, -68.0, -40.0):
         radio = {"quantize": False, "first_path_at_1m_dbm": at_1m_dbm, "sensitivity_dbm": -120.0}
@@ -192,7 +192,7 @@ def test_readings_of_power_saturate():
     assert middle == pytest.approx(-82.0, abs=0.05), "as strong as the highest: 2 dB below it"
 
 
-# One reception for all: what happens to waves shows in flights, served boards, listeners and the workbench alike.
+# One model of reception: effects on radio waves are equal in flights, served boards, listeners and comparisons.
 
 
 PLACES = {"a": (0.0, 0.0, 1.0), "b": (4.0, 0.5, 1.2), "c": (1.5, 3.0, 0.8), "post": (2.0, 0.25, 1.1)}
@@ -208,7 +208,7 @@ GEOMETRIC = {
 
 
 def reception(**more):
-    """Two tags that range and one that listens, nothing moves; the power readings have no noise."""
+    """Two tags that range and one that listens, without motion; power readings have no noise."""
     shadow = {"semi_axes_m": [0.3, 0.3, 1.0], "loss_db_per_m": 20.0}
     return uwbsim.load(
         {
@@ -229,7 +229,7 @@ def reception(**more):
 
 
 def weaken_tag(link, ends):
-    """A plug-in's effect: links of one tag are weaker, and longer by a whole step of the boards' grid."""
+    """An effect of a plug-in: links of one tag are weaker, and longer by a whole step of the boards' grid."""
     hit = (np.array(ends.tags()) == TAG_OF_LOSS).any(axis=0)
     loss, way = LOSS_DB * hit, TICKS * METRES_PER_TICK * hit
     powers = {"power_dbm": link.power_dbm - loss, "total_dbm": link.total_dbm - loss}
@@ -238,7 +238,7 @@ def weaken_tag(link, ends):
 
 @pytest.fixture(scope="module")
 def both():
-    """The same world without the effect and with it: a flight, served boards, and conditions of the workbench."""
+    """The same world without and with the effect: a flight, served boards, and conditions of comparisons."""
     found = []
     for _ in range(2):
         found.append(
@@ -259,7 +259,8 @@ def test_a_plug_ins_effect_shows_in_flights_draw_for_draw(both):
     for name in ("fpp1_dbm", "fpp2_dbm"):
         drop = getattr(before.exchanges, name) - getattr(after.exchanges, name)
         np.testing.assert_allclose(drop, LOSS_DB, atol=1e-9)
-    # Stamps are whole ticks, and the flight is rounded to sub-ticks: the same draws give the same range, but for one.
+    # Stamps are whole ticks, and the flight is rounded to sub-ticks: the same draws give the same range within a
+    # sub-tick.
     longer = raw_range(after.exchanges) - raw_range(before.exchanges)
     np.testing.assert_allclose(longer, TICKS * METRES_PER_TICK, atol=1.01 * METRES_PER_TICK)
     assert after.meta["channel_effects"] == ["weaken"]
@@ -270,7 +271,7 @@ def test_it_shows_in_what_listeners_overhear(both):
     before, after = (found[0].overheard for found in both)
     np.testing.assert_allclose(before["fpp1_dbm"], after["fpp1_dbm"], atol=1e-9)
     np.testing.assert_allclose(before["fpp2_dbm"] - after["fpp2_dbm"], LOSS_DB, atol=1e-9)
-    # The response leaves later by the poll's way more, and is on its way longer by as much.
+    # The response is sent later by the longer path of the poll, and its own path is longer by as much.
     np.testing.assert_allclose((after["rx2"] - after["rx1"]) - (before["rx2"] - before["rx1"]), 2 * TICKS, atol=1)
 
 
@@ -296,7 +297,7 @@ def test_it_shows_in_the_workbench_draw_for_draw(both):
     ids=str,
 )
 def test_flights_boards_listeners_and_workbench_agree_on_every_power(more):
-    """Each part of the world is taken away in turn, so that none of the four can leave it out."""
+    """Each part of the world is removed in turn, so that none of the four can omit it."""
     world = reception(**more)
     flight, (report, overheard), conditions = uwbsim.simulate(world), served(world), conditions_of(world)
     power = flight.exchanges.fpp1_dbm[0]
@@ -318,7 +319,7 @@ def test_a_body_in_the_way_weakens_served_boards_by_its_chord():
     powers = [
         served(reception(**more))[0].fpp1_dbm for more in ({"room": None}, {"room": None, "bodies.3.shadow": None})
     ]
-    # Through an ellipsoid whose height hardly matters: twice its half axis, 20 dB a metre.
+    # Through an ellipsoid whose height hardly matters: twice its half axis, 20 dB per metre.
     assert powers[1] - powers[0] == pytest.approx(20.0 * 0.6, abs=0.1)
 
 
@@ -330,7 +331,7 @@ def test_a_body_in_the_way_weakens_served_boards_by_its_chord():
         ("", lambda link, _: link, "channel effect '': name: found '', expected a word"),
     ],
 )
-def test_effects_that_cannot_be_are_refused(name, effect, fragment):
+def test_wrong_effects_are_refused(name, effect, fragment):
     with pytest.raises(uwbsim.ParameterError, match=fragment):
         uwbsim.register_channel_effect(name, effect)
     assert "x" not in CHANNEL_EFFECTS

@@ -1,4 +1,4 @@
-"""The channel from geometry: images, powers, shadows, persistence, and the same for all who receive."""
+"""The channel from geometry: images, powers, shadows, persistence, and equality for all receivers."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def scenario(*, places=(A, B), motion=None, scatterers=0, stamp_noise=False, **m
 
 
 def world_paths(world, time_s=0.5):
-    """Lengths in metres and complex amplitudes of all paths there are, in order of length."""
+    """Return lengths in metres and complex amplitudes of all paths, in order of length."""
     found = World(world).responses.paths((ZERO, ONE), np.array([time_s]))
     there = np.abs(found.amplitude[0]) > 1e-12
     length = found.detour_m[0][there] + np.linalg.norm(np.subtract(A, B))
@@ -60,7 +60,7 @@ def link(world, time_s=0.5):
 
 
 def test_noiseless_stays_exact():
-    """In free space the response has one path, and ranges are what they are without any model."""
+    """In free space the response has one path, and ranges are those without a model."""
     for distance in (0.3, 4.0, 60.0):
         flight = uwbsim.simulate(scenario(places=((0.0, 0.0, 1.0), (distance, 0.0, 1.0))))
         plain = uwbsim.simulate(scenario(places=((0.0, 0.0, 1.0), (distance, 0.0, 1.0)), radio={"multipath": None}))
@@ -75,7 +75,7 @@ def test_total_power_in_free_space_is_that_of_friis():
 
 
 def shortest_by(axis, at):
-    """The shortest way by a wall, found by moving the point of reflection: Fermat's principle, no images."""
+    """Return the shortest path by a wall, by moving the point of reflection: Fermat's principle, without images."""
     others = [k for k in range(3) if k != axis]
 
     def length(spot):
@@ -93,7 +93,7 @@ def test_reflections_take_the_shortest_ways_by_the_walls():
 
 
 def test_the_reflection_off_the_floor_has_fresnels_loss_and_the_antennas_gains():
-    """Two upright dipoles: polarised in the plane of incidence, in phase off metal, less by |R| off glass."""
+    """Two upright dipoles: polarised in the plane of incidence, in phase off metal, reduced by |R| off glass."""
     for material, epsilon in (("metal", -1e12), ("glass", (2.5 - 1j * 40 / 8.686 * WAVELENGTH_M / 2 / np.pi) ** 2)):
         walls = ROOM | {"material": {"loss_db_per_m": 0.0, "index": 1.0}, "floor": material}
         length, amplitude = world_paths(scenario(room=walls, radio={"antenna": "dipole"}))
@@ -108,7 +108,7 @@ def test_the_reflection_off_the_floor_has_fresnels_loss_and_the_antennas_gains()
         assert abs(turned - expected) < 0.025 * abs(expected)
 
 
-def test_an_upright_dipole_sees_a_metal_wall_turn_its_field_round():
+def test_a_metal_wall_inverts_the_field_of_an_upright_dipole():
     walls = ROOM | {"material": "metal", "floor": {"loss_db_per_m": 0}, "ceiling": {"loss_db_per_m": 0}}
     length, amplitude = world_paths(scenario(places=(A, (5.0, 3.5, 1.0)), room=walls, radio={"antenna": "dipole"}))
     length = length - np.linalg.norm(np.subtract(A, B)) + np.hypot(4.0, 1.5)
@@ -117,7 +117,7 @@ def test_an_upright_dipole_sees_a_metal_wall_turn_its_field_round():
 
 
 def test_a_mirror_on_an_obstacle_is_as_large_as_its_face():
-    """A metal plate beside the link reflects where the image is seen in it, half at its edge, and not beyond."""
+    """A metal plate beside the link reflects where the image is visible in it, half at its edge, and not beyond."""
     strength = []
     for end in (8.0, 3.0, 1.0):
         plate = {"min_m": [-3.0, 4.0, -3.0], "max_m": [end, 4.1, 6.0], "material": "metal", "roughness_mm": 0.0}
@@ -130,7 +130,7 @@ def test_a_mirror_on_an_obstacle_is_as_large_as_its_face():
 
 
 def test_a_blocked_link_ranges_by_the_reflection_and_shows_it_in_its_powers():
-    """A metal plate hides the direct way, not the way by the metal ceiling: its detour is known by hand."""
+    """A metal plate blocks the direct path, not the path by the metal ceiling: its detour is known by hand."""
     walls = ROOM | {"material": {"loss_db_per_m": 0}, "ceiling": "metal"}
     plate = {"min_m": [2.95, -3.0, -9.0], "max_m": [3.0, 9.0, 2.0], "material": "metal"}
     places = ((1.0, 2.0, 1.0), (5.0, 2.0, 1.0))
@@ -143,7 +143,7 @@ def test_a_blocked_link_ranges_by_the_reflection_and_shows_it_in_its_powers():
     np.testing.assert_allclose(raw_range(flight.exchanges) - flight.truth_m, found.excess_m[0], atol=0.006)
 
 
-def test_bodies_stand_in_each_others_way_and_in_their_own():
+def test_bodies_block_paths_of_others_and_their_own():
     shadow = {"semi_axes_m": [0.3, 0.3, 0.3], "loss_db_per_m": 60.0}
     post = {"name": "post", "motion": {"model": "static", "position_m": [3.0, 2.75, 1.3]}, "shadow": shadow}
     free, shaded = (link(scenario(bodies=bodies)) for bodies in ([], [post]))
@@ -160,7 +160,7 @@ DESK = {"min_m": [3.9, 0.5, 0.0], "max_m": [4.1, 5.5, 1.9], "material": "metal"}
 
 @pytest.fixture(scope="module")
 def slow_flight():
-    """Three pairs in a room, of which one tag moves at 0.2 m/s, ten exchanges a second each."""
+    """Three pairs in a room, in which one tag moves at 0.2 m/s, with ten exchanges a second each."""
     moving = scenario(
         places=(A, B, (6.5, 1.0, 0.8), (6.8, 5.2, 2.1)),
         motion=SLOW,
@@ -178,7 +178,7 @@ def of_pair(flight, target):
 
 
 def test_excess_lasts_as_long_as_geometry_does(slow_flight):
-    """2 mm on, waves add up as before; a second and 20 cm on, nearly three wavelengths, they do not."""
+    """After 2 mm, waves add as before; after a second and 20 cm, nearly three wavelengths, they do not."""
     for target in (2, 3, 4):
         excess = of_pair(slow_flight, target)[1]
         assert autocorrelation(excess, 1) > 0.8
@@ -186,7 +186,7 @@ def test_excess_lasts_as_long_as_geometry_does(slow_flight):
 
 
 def test_excess_shows_in_powers_and_responses(slow_flight):
-    """The later the first path seems, the more of the power comes after it, in what boards print."""
+    """The later the first path seems to be, the more of the power comes after it, in the output of boards."""
     rows, _ = of_pair(slow_flight, 2)
     late, rise = [], []
     for row in (row for row in slow_flight.cirs if row.target == 2):
@@ -204,7 +204,7 @@ def test_responses_have_the_first_path_where_the_stamp_is_with_its_power(slow_fl
     for row in slow_flight.cirs:
         taps = np.array(row.magnitudes, dtype=float)[int(row.first_path_index) + np.arange(1, 4)]
         powers.append(10 * np.log10(np.sum(taps**2) / 118**2) - 121.74)
-    # The firmware's estimate of magnitudes, noise, and where the taps lie scatter it.
+    # The firmware's estimate of magnitudes, noise, and the positions of the taps cause scatter.
     difference = np.array(powers) - slow_flight.exchanges.fpp2_dbm
     assert np.median(difference) == pytest.approx(0.3, abs=0.5)
     assert np.quantile(np.abs(difference - np.median(difference)), 0.8) < 1.0
@@ -217,8 +217,8 @@ def test_scatterers_stay_where_they_are_and_more_of_them_leave_the_first_there()
     assert np.all((many.place_m >= 0) & (many.place_m <= np.array([8.0, 6.0, 3.0])))
 
 
-def test_what_is_asked_one_at_a_time_and_all_at_once_is_the_same_draw_for_draw():
-    """While a tag moves: flights ask for many links, served boards for one sender at an instant."""
+def test_links_computed_singly_and_together_have_the_same_draws():
+    """While a tag moves: flights ask for many links, served boards for one sender at a time."""
     world = World(scenario(places=(A, B, (6.5, 1.0, 0.8)), motion=SLOW, **CLUTTER))
     time = (np.linspace(0.0, 0.9, 37) * SUBTICKS_PER_SECOND).astype(np.int64)
     sampled = SampledWorld(World(world.scenario))
@@ -260,12 +260,12 @@ def test_weak_first_paths_have_noisier_stamps():
         ({"room": ROOM | {"floor": "cheese"}}, "room.floor.*cheese.*known are air"),
     ],
 )
-def test_what_cannot_be_is_refused(more, fragment):
+def test_wrong_rooms_and_materials_are_refused(more, fragment):
     with pytest.raises(uwbsim.ScenarioError, match=fragment):
         scenario(**more)
 
 
-# Waves at boxes, bodies and faces: chords by sampling, shadows by Fresnel's integral, reflections by Snell's law.
+# Waves at boxes, bodies and faces: chords by sampling, shadows by the Fresnel integral, reflections by Snell's law.
 
 
 RNG = np.random.default_rng(3)
@@ -306,14 +306,14 @@ def test_loss_and_excess_add_up_over_obstacles():
 
 
 def knife_edge_db(nu):
-    """|1/(1 - j) times the integral from nu on of exp(-j pi u^2/2)|: half of the whole less the part up to nu."""
+    """Return |1/(1 - j) times the integral from nu of exp(-j pi u^2/2)|: half of the whole minus the part up to nu."""
     across = 0.5 - quad(lambda u: np.cos(np.pi * u * u / 2), 0, nu, limit=2000)[0]
     along = 0.5 - quad(lambda u: np.sin(np.pi * u * u / 2), 0, nu, limit=2000)[0]
     return -20 * np.log10(np.hypot(across, along) / np.sqrt(2))
 
 
 def itu_db(nu):
-    """Equation 31 there."""
+    """Equation 31 of the recommendation."""
     return 6.9 + 20 * np.log10(np.sqrt((nu - 0.1) ** 2 + 1) + nu - 0.1)
 
 
@@ -331,7 +331,7 @@ def test_the_approximation_for_bodies_is_that_of_the_itu(nu):
 
 @pytest.mark.parametrize("above_m", [-0.5, -0.1, 0.0, 0.05, 0.2, 0.6])
 def test_a_long_thin_wall_is_a_knife_edge(above_m):
-    """Its upper edge lies this high above the line of sight, 2 m from one end and 3 m from the other."""
+    """Its upper edge is this high above the line of sight, 2 m from one end and 3 m from the other."""
     wall = Obstacle(min_m=(1.999, -50, -50), max_m=(2.001, 50, above_m), material="metal")
     cover, edge = boxes_blocked([wall], np.array([[0.0, 0, 0]]), np.array([[5.0, 0, 0]]))
     nu = above_m * np.sqrt(2 * 5 / (WAVELENGTH_M * 2 * 3))
@@ -341,7 +341,7 @@ def test_a_long_thin_wall_is_a_knife_edge(above_m):
         assert -20 * np.log10(abs(1 - cover[0, 0])) == pytest.approx(itu_db(nu), abs=1.0)
 
 
-def test_boxes_that_are_not_between_the_ends_do_nothing():
+def test_boxes_beside_the_path_have_no_effect():
     box = Obstacle(min_m=(6, -1, -1), max_m=(7, 1, 1), material="metal")
     a, b = np.zeros((2, 3)), np.array([[5.0, 0, 0], [-5.0, 0, 0]])
     assert np.all(boxes_blocked([box], a, b)[0] == 0)
@@ -355,7 +355,7 @@ def past_db(height_m):
 
 
 def test_bodies_have_soft_edges():
-    """A sphere covers a strip up and down and one left and right, each up to two edges; the rest goes by."""
+    """A sphere covers a vertical and a horizontal strip, each with up to two edges; the rest passes."""
     scale = np.sqrt(2 * 5 / (WAVELENGTH_M * 2 * 3))
     across = 1 - 2 * 10 ** (-itu_db(0.3 * scale) / 20)
     for height in (0.0, 0.15, 0.29):
@@ -374,7 +374,7 @@ def test_a_tall_body_is_a_wall_with_two_edges():
     assert loss == pytest.approx(itu_db(nu) - 20 * np.log10(2), abs=0.2), "two fields of as much each"
 
 
-def test_through_a_body_goes_what_its_loss_leaves():
+def test_a_body_attenuates_a_path_by_its_loss():
     mild = Shadow(semi_axes_m=(0.3, 0.3, 0.3), loss_db_per_m=10.0)
     ends = np.array([[-2.0, 0, 0]]), np.array([[3.0, 0, 0]])
     past = 10 ** (-past_db(0.0) / 20)
@@ -390,7 +390,7 @@ COSINES = np.cos(np.radians([0.0, 20.0, 45.0, 70.0, 89.0]))
 
 @pytest.mark.parametrize("epsilon", [2.0, 5.24 - 0.61j, 80.0 - 4.0j])
 def test_fresnels_coefficients_by_snells_law(epsilon):
-    """As they stand in optics books, with the angle of refraction; the code has it by no angle at all."""
+    """As in optics books, with the angle of refraction; the code uses no angle."""
     index, incidence = np.sqrt(epsilon + 0j), np.arccos(COSINES)
     refraction = np.arcsin(np.sin(incidence) / index)
     across = -np.sin(incidence[1:] - refraction[1:]) / np.sin(incidence[1:] + refraction[1:])
@@ -408,15 +408,15 @@ def test_reflection_loss_of_materials_straight_on(name, loss_db):
     assert -20 * np.log10(abs(s[0])) == pytest.approx(loss_db, abs=0.1)
 
 
-def test_a_lossy_material_loses_what_it_says():
+def test_a_lossy_material_has_its_stated_loss():
     """A wave exp(-j k n z) through a metre of it."""
     n = np.sqrt(permittivity(Material(loss_db_per_m=80.0, index=2.4)))
     assert -20 * np.log10(abs(np.exp(-2j * np.pi / WAVELENGTH_M * n))) == pytest.approx(80.0, rel=1e-9)
     assert n.real == pytest.approx(2.4)
 
 
-def test_roughness_takes_what_rayleigh_says():
-    """Path differences of 2 h cos(theta) spread phases by 4 pi h cos(theta)/wavelength; Gaussian ones average so."""
+def test_roughness_reduces_reflections_as_rayleigh_states():
+    """Path differences of 2 h cos(theta) spread phases by 4 pi h cos(theta)/wavelength, averaged over a Gaussian."""
     rng = np.random.default_rng(1)
     for cosine in (1.0, 0.5):
         phase = 4 * np.pi * rng.normal(0, 0.006, 400_000) * cosine / WAVELENGTH_M
