@@ -199,14 +199,13 @@ def robust_fit(  # noqa: PLR0913 - a search has that many sides
     every = whole if inside is None else whole.sample(np.flatnonzero(inside))
     gauge = (*model.gauge_rows(layout), *model.held_rows(layout))
     x = layout.start(start.optimum.by_kind() if start is not None else None)
-    chosen = None
-    if sample is not None and sample < len(error):
-        # A fixed random choice: a regular one could coincide with the schedule of pairs.
-        chosen = np.sort(np.random.default_rng(0).permutation(len(error))[:sample])
     rows, effects = [every], [1.0]
     if heard is not None:
         rows, effects = [every, heard.rows(layout, every.errors)], [1.0, heard.design_effect]
-    rows = rows if chosen is None else [each.sample(chosen) for each in rows]
+    if sample is not None and sample < len(error):
+        # A fixed random choice: a regular one could coincide with the schedule of pairs.
+        chosen = np.sort(np.random.default_rng(0).permutation(len(error))[:sample])
+        rows = [each.sample(chosen) for each in rows]
     priors, steps = Priors(layout), 0
     for turn in range(2 if start is not None else 4):
         residuals = [each.residuals(x) for each in rows]

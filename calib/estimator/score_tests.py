@@ -12,12 +12,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import sparse
-from scipy.special import stdtr
 
 from calib.estimator.optimize import Optimum
 from calib.estimator.range_rows import RangeRows
 from calib.estimator.rows import Terms
 from calib.estimator.time_blocks import Persistence, TimeBlocks, persistence
+from calib.findings import exceeds
 from uwblink.arrays import Floats, Ints
 
 REACHED = 1e-3
@@ -276,7 +276,7 @@ def findings(tested: Tested, several: int, rate: float, tolerance_m: float = 0.0
         beyond = np.maximum(np.abs(total) - tolerance_m * np.diag(information), 0.0)
         deviation = np.where(known, np.copysign(beyond, total) / std, 0.0)
         top = int(np.argmax(np.abs(deviation)))
-        p_value = min(several * 2 * float(stdtr(freedom, -abs(float(deviation[top])))), 1.0)
+        p_value = exceeds(float(deviation[top]), 1.0, freedom, tried=several)
         if p_value > rate:
             return
         # Residuals are fitted minus true: the offset of ranges has the opposite sign.

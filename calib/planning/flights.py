@@ -21,9 +21,9 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.inverse import inverse_of
 from calib.estimator.optimize import EVIDENCE_STEPS
 from calib.estimator.range_model import RangeModel
-from calib.estimator.range_rows import RESIDUAL, RangeRows
+from calib.estimator.range_rows import RESIDUAL
 from calib.estimator.rows import sum_rows
-from calib.estimator.unknowns import Layout, Priors
+from calib.estimator.unknowns import Priors
 from calib.evaluation.filters import IMUS
 from calib.planning.reference_motion import reference_motion
 from calib.planning.result import FlightPlan, NextBest, mean_std_ns
@@ -153,16 +153,14 @@ class Information:
         self.jerk_m_s3 = _jerk(start["path"], self.motion.places.step_s)
         motion = self.motion.unknowns(start, self.jerk_m_s3)
         fixed = [replace(one, priors=tuple(replace(prior, bounds=None) for prior in one.priors)) for one in motion]
-        self.layout = Layout((*model.unknowns, *fixed))
+        self.layout, rows = model.build(np.zeros(len(scene.time_s)), flight.errors, fixed)
         self.x = self.layout.start()
         knots = np.zeros(0) if model.curve is None else model.curve.knots
         for kind in model.curve_kinds():
             centres = np.convolve(knots[1:-1], np.full(3, 1 / 3), mode="valid")
             # A typical bias curve has 5 cm and 3 rad over the range of powers; it determines the estimated smoothness.
             self.x[self.layout.where[kind]] = 0.05 * np.sin(3.0 * centres)
-        geometry = Distances.of(self.motion, self.layout, (model.ranges.initiator, model.ranges.target), scene.time_s)
-        raw = np.zeros(len(scene.time_s))
-        ranges = RangeRows.of(raw, model.key(), model.parts, flight.errors, self.layout, geometry)
+        ranges = replace(rows, geometry=Distances.of_ranges(self.motion, self.layout))
         of_ranges = sum_rows([ranges, *model.gauge_rows(self.layout)], self.x).information
         beside = sum_rows(list(known_rows(self.motion, self.layout).values()), self.x).information
         priors, self.delays = Priors(self.layout), self.layout.indices(["delay"])

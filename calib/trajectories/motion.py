@@ -226,6 +226,12 @@ class Distances:
         # anchors at given positions no entry is used, and any column is valid.
         return cls((first, second), np.maximum(np.where(columns < 0, columns.max(axis=1)[:, None], columns), 0))
 
+    @classmethod
+    def of_ranges(cls, motion: Motion, layout: Layout) -> Distances:
+        """Return the distances of the ranges of a motion's scene."""
+        scene = motion.scene
+        return cls.of(motion, layout, (scene.ranges.initiator, scene.ranges.target), scene.time_s)
+
     def antennas(self, x: Floats, rows: Ints | slice = slice(None)) -> tuple[Floats, Floats, Floats, Floats]:
         """Return the antennas of both ends (n, 3), and their lever arms in the world's axes (n, 3)."""
         found = []

@@ -75,9 +75,8 @@ def fit_motion(
     """Return the motion near a start that fits raw ranges best, by Cauchy's likelihood with decreasing scales."""
     motion = Motion.of(scene)
     layout = Layout(motion.unknowns(start, jerk_m_s3))
-    geometry = Distances.of(motion, layout, (scene.ranges.initiator, scene.ranges.target), scene.time_s)
     key = np.zeros(len(scene.time_s), dtype=np.int64)
-    rows = RangeRows.of(scene.ranges.raw_m, key, [], _cauchy(scales_m[0]), layout, geometry)
+    rows = RangeRows.of(scene.ranges.raw_m, key, [], _cauchy(scales_m[0]), layout, Distances.of_ranges(motion, layout))
     known, priors, x, value = list(known_rows(motion, layout).values()), Priors(layout), layout.start(), 0.0
     for scale in scales_m:
         these: list[Rows] = [replace(rows, errors=_cauchy(scale)), *known]
@@ -126,11 +125,11 @@ class Search:
         jerk_m_s3: float = JERK_M_S3,
     ) -> None:
         """Build layout, priors and rows with the present values; `unknowns` and `parts` are for the errors."""
-        model, ranges, motion = self.model, self.model.ranges, self.motion
-        self.layout = Layout((*model.unknowns, *motion.unknowns(self.origin, jerk_m_s3), *unknowns))
-        self.geometry = Distances.of(motion, self.layout, (ranges.initiator, ranges.target), motion.scene.time_s)
-        parts = (*model.parts, *parts)
-        self.rows = RangeRows.of(self.error_m, model.key(), parts, errors, self.layout, self.geometry)
+        model, motion = self.model, self.motion
+        more = (*motion.unknowns(self.origin, jerk_m_s3), *unknowns)
+        self.layout, rows = model.build(self.error_m, errors, more, parts)
+        self.geometry = Distances.of_ranges(motion, self.layout)
+        self.rows = replace(rows, geometry=self.geometry)
         self.known = known_rows(motion, self.layout)
         self.gauge = (*model.gauge_rows(self.layout), *model.held_rows(self.layout))
         self.x = self.layout.start(self.values)
