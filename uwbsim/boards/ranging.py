@@ -89,8 +89,7 @@ def initiate(board: VirtualBoard, request: RangeCommand) -> Attempt:
 def _report(board: VirtualBoard, poll: Frame, request: RangeCommand, first: Received, last: Received) -> Steps:
     """Send the final if the target reports too, print the report, and the impulse response if requested."""
     target = request.target
-    mine = poll.stamp & MASK, first.stamp & MASK, last.stamp & MASK if request.double_sided else 0
-    final = FinalPayload(mine, first.power_dbm, first.skew_ppm)
+    final = _final(first, (poll.stamp, first.stamp, last.stamp), request)
     to_final = 136 * NS_PER_US if request.target_reports else 0  # from the end of the target's last frame
     if request.target_reports:
         yield board.sleep(to_final)
@@ -117,7 +116,7 @@ def answer(board: VirtualBoard, received: Received, request: RangeCommand) -> St
         # The delay of a single-sided exchange cannot be set on the boards (firmware wire format, 0.5).
         last, printed = air.scheduled_stamps(board.id, received.stamp, 1500)
         first, sent = last, (printed, printed)
-    radio.send(initiator, _of_target(received, *sent, request), last, excess)
+    radio.send(initiator, _final(received, (received.stamp, *sent), request), last, excess)
     if not request.target_reports:
         return
     final = yield from expected(board, FinalPayload, initiator, board.id)
@@ -127,14 +126,14 @@ def answer(board: VirtualBoard, received: Received, request: RangeCommand) -> St
     if request.get_cir:
         yield from print_cir(board, initiator, board.id, final)
     # Its own report has the chip's stamps, not those that it sent.
-    mine = _of_target(received, first, last, request)
+    mine = _final(received, (received.stamp, first, last), request)
     board.send(range_report(TargetRangeReport, initiator, final_of(final), mine))
 
 
-def _of_target(poll: Received, first: int, last: int, request: RangeCommand) -> FinalPayload:
-    """Return the printed stamps of a target, rx1, tx2 and tx3 (0 in single-sided ranging), and its readings."""
-    stamps = poll.stamp & MASK, first & MASK, last & MASK if request.double_sided else 0
-    return FinalPayload(stamps, poll.power_dbm, poll.skew_ppm)
+def _final(first: Received, stamps: tuple[int, int, int], request: RangeCommand) -> FinalPayload:
+    """Return a board's printed stamps, the third 0 in single-sided ranging, and its readings of the first frame."""
+    one, two, three = (stamp & MASK for stamp in stamps)
+    return FinalPayload((one, two, three if request.double_sided else 0), first.power_dbm, first.skew_ppm)
 
 
 def range_report(kind: type[RangeReport], neighbour: int, initiator: FinalPayload, target: FinalPayload) -> RangeReport:

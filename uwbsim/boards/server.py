@@ -244,7 +244,7 @@ class Server:
         After that, bodies do not move.
         """
         longer = min(max(scenario.run.duration_s, duration_s or 7200.0), LONGEST_RUN_S)
-        return scenario.model_copy(update={"run": scenario.run.model_copy(update={"duration_s": longer})})
+        return scenario.changed("run", duration_s=longer)
 
     def run(self, stop: Callable[[], bool], duration_s: float = float("inf")) -> None:
         """Serve until `stop` returns True or the duration is over."""

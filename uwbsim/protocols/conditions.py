@@ -160,7 +160,7 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
                 "simulated by `uwbsim run` and served boards only, not in comparisons of protocols"
             )
     # Exchanges that an outage prevents have no range.
-    scenario = scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"outages": None})})
+    scenario = scenario.changed("radio", outages=None)
     plan = schedule(scenario)
     if not len(plan.start):
         raise ScenarioError(

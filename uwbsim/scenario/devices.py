@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
@@ -141,11 +141,43 @@ class GroupDelayHarmonics(Section):
     turned_deg: float = Field(0.0, description="How far the board is turned about the body's z axis.")
 
 
-class GroupDelayTable(Section):
+class DirectionTable(Section):
+    """A quantity over azimuth and elevation in the body's frame: a full grid, interpolated linearly.
+
+    `quantity` is the key of its values, a row for each azimuth.
+    """
+
+    quantity: ClassVar[str]
+
+    azimuth_deg: tuple[float, ...] = Field(description="Azimuths in the body's frame, from -180 to 180, increasing.")
+    elevation_deg: tuple[float, ...] = Field(description="Elevations in the body's frame, from -90 to 90, increasing.")
+
+    @model_validator(mode="after")
+    def _check_grid(self) -> Self:
+        for axis, values, end in (
+            ("azimuth_deg", self.azimuth_deg, 180.0),
+            ("elevation_deg", self.elevation_deg, 90.0),
+        ):
+            rising = all(a < b for a, b in itertools.pairwise(values))
+            require(len(values) > 1 and rising, f"{axis}: must increase, and hold two values or more")
+            ends = f"{axis}: runs from {values[0]:g} to {values[-1]:g}, expected {-end:g} to {end:g}"
+            require((values[0], values[-1]) == (-end, end), ends)
+        name, rows = self.quantity, getattr(self, self.quantity)
+        found = f"{name}: found {len(rows)} rows, the azimuths are {len(self.azimuth_deg)}"
+        require(len(rows) == len(self.azimuth_deg), found)
+        count = len(self.elevation_deg)
+        for k, row in enumerate(rows):
+            require(len(row) == count, f"{name}[{k}]: found {len(row)} values, the elevations are {count}")
+        return self
+
+
+class GroupDelayTable(DirectionTable):
     """Group delay in centimetres over azimuth and elevation in the body's frame: a full grid, interpolated linearly.
 
     `file` is a CSV table with the columns azimuth_deg, elevation_deg, delay_cm.
     """
+
+    quantity = "delay_cm"
 
     model: Literal["table"] = Field(description="As a table over directions.")
     file: str | None = Field(
@@ -153,38 +185,13 @@ class GroupDelayTable(Section):
         description="CSV file with the columns azimuth_deg, elevation_deg, delay_cm; the other keys are then read from "
         "it.",
     )
-    azimuth_deg: tuple[float, ...] = Field(description="Azimuths in the body's frame, from -180 to 180, increasing.")
-    elevation_deg: tuple[float, ...] = Field(description="Elevations in the body's frame, from -90 to 90, increasing.")
     delay_cm: tuple[tuple[float, ...], ...] = Field(
         description="A row for each azimuth, a delay in it for each elevation.",
     )
     turned_deg: float = Field(0.0, description="How far the board is turned about the body's z axis.")
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        check_grid(self.azimuth_deg, self.elevation_deg, "delay_cm", self.delay_cm)
-        return self
-
 
 GroupDelay = Annotated[GroupDelayHarmonics | GroupDelayTable, Field(discriminator="model")]
-
-
-def check_grid(
-    azimuth_deg: tuple[float, ...], elevation_deg: tuple[float, ...], name: str, rows: tuple[tuple[float, ...], ...]
-) -> None:
-    """Raise `ValueError` where azimuths by elevations are no full grid of all directions, with a value each."""
-    for axis, values, low, high in (
-        ("azimuth_deg", azimuth_deg, -180.0, 180.0),
-        ("elevation_deg", elevation_deg, -90.0, 90.0),
-    ):
-        rising = all(a < b for a, b in itertools.pairwise(values))
-        require(len(values) > 1 and rising, f"{axis}: must increase, and hold two values or more")
-        ends = f"{axis}: runs from {values[0]:g} to {values[-1]:g}, expected {low:g} to {high:g}"
-        require((values[0], values[-1]) == (low, high), ends)
-    require(len(rows) == len(azimuth_deg), f"{name}: found {len(rows)} rows, the azimuths are {len(azimuth_deg)}")
-    count = len(elevation_deg)
-    for k, row in enumerate(rows):
-        require(len(row) == count, f"{name}[{k}]: found {len(row)} values, the elevations are {count}")
 
 
 Register = Annotated[int, Field(ge=0, le=REGISTER_MAX)]

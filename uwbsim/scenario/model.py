@@ -188,6 +188,10 @@ class Scenario(Section):
             f"{self.run.duration_s:g}); use a longer run",
         )
 
+    def changed(self, section: str, **values: Any) -> Self:
+        """Return the scenario with other values in a table such as `run`; they are not validated."""
+        return self.model_copy(update={section: getattr(self, section).model_copy(update=values)})
+
     def pairs(self) -> list[tuple[int, int]]:
         """Return the (initiator, target) pairs in the order in which they range; of broadcasts, in either role."""
         if self.ranging.plan == "broadcast":

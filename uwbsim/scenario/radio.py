@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwbsim.scenario.base import NotDecreasing, NotNegative, Positive, Section, Share, TagId, look_up, require
-from uwbsim.scenario.devices import GroupDelay, check_grid
+from uwbsim.scenario.devices import DirectionTable, GroupDelay
 
 # Knots of the splines published with the paper (campaigns 2022-08 and 2022-07, decargroup/uwb_calibration).
 _AUGUST: Final = [0.014173673264269979] * 4 + [1.599984520527571] * 4
@@ -279,19 +279,14 @@ class BiasTable(Section):
         return self
 
 
-class AntennaTable(Section):
+class AntennaTable(DirectionTable):
     """Gain in dB over azimuth and elevation in the body's frame: a full grid, interpolated linearly."""
 
-    azimuth_deg: tuple[float, ...] = Field(description="Azimuths in the body's frame, from -180 to 180, increasing.")
-    elevation_deg: tuple[float, ...] = Field(description="Elevations in the body's frame, from -90 to 90, increasing.")
+    quantity = "gain_db"
+
     gain_db: tuple[tuple[float, ...], ...] = Field(
         description="A row for each azimuth, a gain in it for each elevation.",
     )
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        check_grid(self.azimuth_deg, self.elevation_deg, "gain_db", self.gain_db)
-        return self
 
 
 class Radio(Section):

@@ -117,8 +117,7 @@ class Work:
 
     def _evaluated(self, scenario: Scenario, protocol: str, evaluate: Evaluate) -> Row:
         """Simulate a flight with a protocol, and have it evaluated."""
-        ranging = scenario.ranging.model_copy(update={"protocol": protocol})
-        simulated = simulate(scenario.model_copy(update={"ranging": ranging}))
+        simulated = simulate(scenario.changed("ranging", protocol=protocol))
         try:
             figures = dict(evaluate(simulated))
         except Exception as error:

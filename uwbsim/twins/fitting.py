@@ -220,8 +220,8 @@ class Twin:
         count = seeds or int(np.clip(-(-6000 // len(self.measured)), 1, 8))
         flights = []
         for k in range(count):
-            one = self.scenario.model_copy(update={"run": self.scenario.run.model_copy(update={"seed": k + 1})})
-            flights.append(TwinFlight.of(simulate(one), self.known, "the simulated twin", fewest=2))
+            simulated = simulate(self.scenario.changed("run", seed=k + 1))
+            flights.append(TwinFlight.of(simulated, self.known, "the simulated twin", fewest=2))
             if progress:
                 progress((k + 1) / count)
         found = [_compared(name, self.measured, flights) for name in QUANTITIES]
