@@ -13,7 +13,7 @@ import pytest
 import uwbsim
 from tests.boards import bench_scenario, served
 from uwblink.boards.board import Board
-from uwblink.errors import RefusedError
+from uwblink.errors import PortLostError, PortMissingError, RefusedError
 from uwblink.importers.poses import read_poses
 from uwblink.wire import messages as m
 from uwblink.wire.fields import INT, PRINTED, TEXT
@@ -342,3 +342,22 @@ def test_a_server_prints_when_boards_stand_still():
         "  0.3 s  place 2 of 3: boards stand until 0.5 s",
         "  0.6 s  place 3 of 3: boards stay there",
     ]
+
+
+def test_an_unplugged_board_is_gone_until_it_is_plugged_in_again():
+    ports = uwbsim.VirtualPorts("noiseless")
+    tag, name = next(iter(ports.names.items()))
+    port, board = ports.port(tag), ports.bench.boards[tag]
+    port.write(b"C01\r")
+    board.power_off()
+    with pytest.raises(PortLostError):
+        port.read(0.1)
+    with pytest.raises(PortLostError):
+        port.write(b"C01\r")
+    with pytest.raises(PortMissingError):
+        ports.open(name)
+    assert ports.moved(name, None) is None
+    board.power_cycle()
+    assert (ports.open(name), ports.moved(name, None)) == (port, name)
+    port.write(b"C01\r")
+    assert port.read(0.1) == b"R01|%d\r\n" % tag
