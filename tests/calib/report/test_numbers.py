@@ -439,7 +439,7 @@ def test_reports_without_motion_capture_state_known_facts(known):
     _, text, table = foundations(blind)
     assert [type(text), type(table)] == [Text, Table]
     assert "positions known for 10.0 s" in text.text
-    assert ["anchors at given places", "a, b"] in table.rows
+    assert ["anchors at given positions", "a, b"] in table.rows
     assert list(grades(blind).values()) == ["doubt"]
 
 
