@@ -112,7 +112,9 @@ REMEDIES: Final = {
     "few ranges of a pair": "record for longer",
     "powers outside those of the curve": "use the curve of a calibration at such powers",
     "common part of delays": "state a measured distance (`known`)",
-    "two solutions of a survey": "add an arrangement or a known distance",
+    "delays that a survey leaves open": "record another arrangement, or measure a distance: calib plan survey proposes "
+    "which",
+    "two solutions of a survey": "measure a distance that differs between the two solutions, and give it as known",
     # What is doubtful about the data as a whole.
     "few independent stretches": "record for longer",
     "short recording": "record for longer",

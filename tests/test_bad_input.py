@@ -311,7 +311,11 @@ def test_a_second_server_does_not_take_the_links_of_the_first(tmp_path):
     first = Terminal(tmp_path / "tag1")
     with pytest.raises(PortError, match="in use by another server"):
         Terminal(tmp_path / "tag1")
+    (tmp_path / "tag1").unlink()  # as the error says
+    second = Terminal(tmp_path / "tag1")
     first.unplug()
+    assert (tmp_path / "tag1").exists()
+    second.unplug()
     (tmp_path / "tag1").symlink_to(tmp_path / "gone")
     Terminal(tmp_path / "tag1").unplug()
 

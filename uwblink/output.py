@@ -117,16 +117,15 @@ def take_name(partial: Path, path: Path) -> None:
     partial.replace(path)
 
 
-def new_file(path: Path, *, force: bool) -> TextIO:
-    """Create a text file that is written under its own name; links are not followed.
+def new_file(path: Path) -> TextIO:
+    """Create or replace a text file that is written under its own name; links are not followed.
 
     What is written between two flushes, up to a megabyte, reaches the file at once. Raises `OutputError`, and what
     `check_output` raises.
     """
-    check_output(path, force=force)
+    check_output(path, force=True)
     with raising(OutputError, f"{path}: cannot be written"):
-        if force:
-            path.unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
         return path.open("x", 2**20, encoding="utf-8", newline="\n")
 
 

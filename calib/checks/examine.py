@@ -381,12 +381,9 @@ CHECKS: Final = (
         "contradictions that the survey found by its own tests", CERTAIN,
         {
             **{fault: REMEDIES[fault] for fault in ("board moved within an arrangement", *HYPOTHESES)},
+            **{fault: REMEDIES[fault] for fault in ("delays that a survey leaves open", "two solutions of a survey")},
             "survey determines nothing": "record the arrangements that calib plan survey proposes",
-            "delays that a survey leaves open": "record another arrangement, or measure a distance: calib plan "
-            "survey proposes which",
             "many reflected pairs": "place the boards in line of sight of each other, away from walls and metal",
-            "two solutions of a survey": "measure a distance that differs between the two solutions, and give it as "
-            "known",
             "powers that hardly vary": "record arrangements with nearer and farther boards, or use the curve of "
             "another calibration (`curve_from`)",
         },

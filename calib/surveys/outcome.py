@@ -121,7 +121,7 @@ def _limits(
     if verdict.free:
         delays = ", ".join(verdict.named("delay"))
         text = f"not determined: {'; '.join(verdict.free)}" + f"; left out: tags {delays}" * bool(delays)
-        yield warning("undetermined delays", text)
+        yield warning("delays that a survey leaves open", text)
     if found.network.curve is not None:
         yield warning(
             "common part of delays",

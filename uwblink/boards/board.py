@@ -210,22 +210,10 @@ Reply = TypeVar("Reply", bound=Message)
 class Board(Closing):
     """One board, for use in one thread at a time.
 
-    `Board.open("/dev/ttyACM0")` opens a board on a serial port. An example with two simulated boards:
+    `Board.open("/dev/ttyACM0")` opens a board on a serial port. An example with two simulated boards, 10 and 20:
 
     >>> import uwblink, uwbsim
-    >>> ports = uwbsim.VirtualPorts(
-    ...     uwbsim.load(
-    ...         '''
-    ...         run = { duration_s = 10.0 }
-    ...         ranging = { rate_hz = 50 }
-    ...         bodies = [
-    ...             { name = "near", motion = { model = "static", position_m = [0.0, 0.0, 1.0] } },
-    ...             { name = "far", motion = { model = "static", position_m = [3.0, 0.0, 1.0] } },
-    ...         ]
-    ...         tags = [{ id = 10, body = "near" }, { id = 20, body = "far" }]
-    ...         '''
-    ...     )
-    ... )
+    >>> ports = uwbsim.VirtualPorts(uwbsim.load("two_boards_on_a_bench/bench"))
     >>> with uwblink.Board(ports.port(10)) as board:
     ...     report = board.range(20)
     >>> board.id, report.neighbour, abs(report.range_m - 3.0) < 0.2

@@ -130,8 +130,9 @@ def dialect_of(name: str) -> Dialect:
         parse([])  # for the errors of the map
         return Dialect("lines", "a template", parse)
     if name not in DIALECTS:
-        known_names = ", ".join(DIALECTS)
-        raise ArgumentError(f"found {name!r:.60}, allowed: {known_names}, or a map (.toml)", parameter="dialect")
+        raise ArgumentError(
+            f"found {name!r:.60}, allowed: {', '.join(DIALECTS)}, or a map (.toml)", parameter="dialect"
+        )
     return DIALECTS[name]
 
 

@@ -49,19 +49,7 @@ class Heard:
     Every function among the listeners of `uwblink.record` is called with these:
 
     >>> import uwblink, uwbsim
-    >>> ports = uwbsim.VirtualPorts(
-    ...     uwbsim.load(
-    ...         '''
-    ...         run = { duration_s = 10.0 }
-    ...         ranging = { rate_hz = 50 }
-    ...         bodies = [
-    ...             { name = "near", motion = { model = "static", position_m = [0.0, 0.0, 1.0] } },
-    ...             { name = "far", motion = { model = "static", position_m = [3.0, 0.0, 1.0] } },
-    ...         ]
-    ...         tags = [{ id = 10, body = "near" }, { id = 20, body = "far" }]
-    ...         '''
-    ...     )
-    ... )
+    >>> ports = uwbsim.VirtualPorts(uwbsim.load("two_boards_on_a_bench/bench"))
     >>> heard = []
     >>> plan = uwblink.RangingPlan(rate_hz=20.0)
     >>> _ = uwblink.record(
@@ -78,7 +66,7 @@ class Heard:
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """One turn of the plan: its pair, the report (None: the exchange failed), and when it ended."""
+    """One turn of the plan: when its report came, its pair, and the report, None if the exchange failed."""
 
     time_ns: int
     pair: Pair
@@ -89,19 +77,7 @@ class Listener:
     """Base of listeners: override the methods that you need; by default they do nothing.
 
     >>> import uwblink, uwbsim
-    >>> ports = uwbsim.VirtualPorts(
-    ...     uwbsim.load(
-    ...         '''
-    ...         run = { duration_s = 10.0 }
-    ...         ranging = { rate_hz = 50 }
-    ...         bodies = [
-    ...             { name = "near", motion = { model = "static", position_m = [0.0, 0.0, 1.0] } },
-    ...             { name = "far", motion = { model = "static", position_m = [3.0, 0.0, 1.0] } },
-    ...         ]
-    ...         tags = [{ id = 10, body = "near" }, { id = 20, body = "far" }]
-    ...         '''
-    ...     )
-    ... )
+    >>> ports = uwbsim.VirtualPorts(uwbsim.load("two_boards_on_a_bench/bench"))
     >>> class Farthest(uwblink.Listener):
     ...     range_m = 0.0
     ...

@@ -16,10 +16,12 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.client import HTTPException
+from http.server import BaseHTTPRequestHandler
 from importlib.resources import files
 from pathlib import Path
-from typing import Final
+from socketserver import BaseRequestHandler, ThreadingTCPServer
+from typing import Any, Final
 
 import numpy as np
 
@@ -44,6 +46,29 @@ m.querySelector('p').textContent='This recording has ended; below is the last th
 """
 
 
+class BackgroundServer(ThreadingTCPServer):
+    """A server of TCP connections in threads of this process, until `close`."""
+
+    allow_reuse_address = True
+    daemon_threads = True
+    request_queue_size = 128
+
+    def __init__(self, address: Any, handler: type[BaseRequestHandler]) -> None:
+        """Serve at an address; raises `OSError`."""
+        super().__init__(address, handler)
+        threading.Thread(target=self.serve_forever, name="uwblink server", daemon=True).start()
+
+    def close(self) -> None:
+        """End the server; connections end with their handlers."""
+        self.shutdown()
+        self.server_close()
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Ignore lost connections; the recorder uses the terminal."""
+        if not isinstance(sys.exception(), OSError | HTTPException):
+            super().handle_error(request, client_address)  # type: ignore[arg-type]
+
+
 class LivePage(Closing, Listener):
     """A page that shows the progress of a recording. A context manager: leaving it ends the server."""
 
@@ -55,8 +80,7 @@ class LivePage(Closing, Listener):
         self._path, self._correct = path, correct
         self._progress = Progress()
         with raising(PortError, f"port {port}: the page cannot be served there"):
-            self._server = _Server(("127.0.0.1", port), type("Handler", (_Handler,), {"page": self}))
-        threading.Thread(target=self._server.serve_forever, name="uwblink page", daemon=True).start()
+            self._server = BackgroundServer(("127.0.0.1", port), type("Handler", (_Handler,), {"page": self}))
 
     @property
     def url(self) -> str:
@@ -73,8 +97,7 @@ class LivePage(Closing, Listener):
 
     def close(self) -> None:
         """End the server."""
-        self._server.shutdown()
-        self._server.server_close()
+        self._server.close()
 
     def html(self) -> str:
         """Return the whole page."""
@@ -180,16 +203,6 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the library's name
         """Print nothing: the recorder uses the terminal."""
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    request_queue_size = 128
-
-    def handle_error(self, request: object, client_address: object) -> None:
-        """Ignore lost connections; the recorder uses the terminal."""
-        if not isinstance(sys.exception(), OSError):
-            super().handle_error(request, client_address)  # type: ignore[arg-type]
 
 
 def _clock(time_ns: int) -> str:

@@ -265,9 +265,7 @@ class Terminal:
         return os.ttyname(self._ends[1]) if self._ends else "(unplugged)"
 
     def plug(self) -> None:
-        """Open the port, unless it is open."""
-        if self._ends:
-            return
+        """Open the port, which must not be open."""
         if self._link:
             _free(self._link)
         # The client's end is also kept open here: otherwise reads fail if no client has it open.
@@ -284,7 +282,8 @@ class Terminal:
             return
         if self._link:
             with contextlib.suppress(OSError):
-                self._link.unlink()
+                if os.readlink(self._link) == os.ttyname(self._ends[1]):  # else it is the link of a later server
+                    self._link.unlink()
         for end in self._ends:
             os.close(end)
         self._ends = None
@@ -310,8 +309,8 @@ def open_terminals(links: Mapping[Key, Path | None]) -> dict[Key, Terminal]:
     Links of a server that was killed are all removed first, because the system uses the names of terminals again: a
     link that remains could lead to a terminal that is opened here for another key.
     """
-    for link in filter(None, links.values()):
-        _free(link)
+    for wanted in filter(None, links.values()):
+        _free(wanted)
     opened: dict[Key, Terminal] = {}
     try:
         for key, link in links.items():

@@ -64,19 +64,7 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     `RecordingError` (cannot be written, disk full); the file stays readable.
 
     >>> import uwblink, uwbsim
-    >>> ports = uwbsim.VirtualPorts(
-    ...     uwbsim.load(
-    ...         '''
-    ...         run = { duration_s = 10.0 }
-    ...         ranging = { rate_hz = 50 }
-    ...         bodies = [
-    ...             { name = "near", motion = { model = "static", position_m = [0.0, 0.0, 1.0] } },
-    ...             { name = "far", motion = { model = "static", position_m = [3.0, 0.0, 1.0] } },
-    ...         ]
-    ...         tags = [{ id = 10, body = "near" }, { id = 20, body = "far" }]
-    ...         '''
-    ...     )
-    ... )
+    >>> ports = uwbsim.VirtualPorts(uwbsim.load("two_boards_on_a_bench/bench"))
     >>> plan = uwblink.RangingPlan(rate_hz=20.0)
     >>> done = uwblink.record(ports.names.values(), "flight.uwb", plan, duration_s=1.0, using=ports)
     >>> len(uwblink.load("flight.uwb").exchanges) == done.exchanges > 15

@@ -217,12 +217,12 @@ class Recorder(Closing):
         except PortLostError as error:
             self._report_lost(station, error)
             return
-        time_ns = self._notify_of_bytes(station, "in", data) if data else 0
+        time_ns = self._notify_of_bytes(station, "in", data) if data else self._ports.host_ns()
         events, outcome = station.connection.receive(data, self._ports.now_s())
         for event in events:
             self._notify(station, time_ns, event)
         if outcome:
-            self._finish_command(station, outcome)
+            self._finish_command(station, outcome, time_ns)
 
     def _notify_of_bytes(self, station: Station, direction: str, data: bytes) -> int:
         time_ns = self._ports.host_ns()
@@ -245,7 +245,7 @@ class Recorder(Closing):
         for listener in self._listeners:
             listener.on_message(heard)
 
-    def _finish_command(self, station: Station, outcome: CommandOutcome) -> None:
+    def _finish_command(self, station: Station, outcome: CommandOutcome, time_ns: int) -> None:
         now_s = self._ports.now_s()
         if outcome.error:
             kind = "time-out" if isinstance(outcome.error, TimeoutError) else "failed exchange"
@@ -261,10 +261,11 @@ class Recorder(Closing):
                 # The two boards of the exchange, and passive ones, print their impulse responses.
                 both = self._plan.target_reports or self._passive
                 self._quiet_until_s = now_s + (QUIET_TARGET_S if both else QUIET_AFTER_CIR_S)
-            self._end_turn(self._active[1], outcome.reply if isinstance(outcome.reply, RangeReport) else None)
+            report = outcome.reply if isinstance(outcome.reply, RangeReport) else None
+            self._end_turn(Turn(time_ns, self._active[1], report))
 
-    def _end_turn(self, pair: Pair, report: RangeReport | None) -> None:
-        turn, self._active = Turn(self._ports.host_ns(), pair, report), None
+    def _end_turn(self, turn: Turn) -> None:
+        self._active = None
         for listener in self._listeners:
             listener.on_turn(turn)
 
@@ -272,7 +273,7 @@ class Recorder(Closing):
         self._fault(station, "unplugged", str(error))
         station.unplug(self._ports.now_s())
         if self._active and self._active[0] is station:
-            self._end_turn(self._active[1], None)
+            self._end_turn(Turn(self._ports.host_ns(), self._active[1], None))
 
     def _fault(self, station: Station, kind: str, detail: str, failed: RangeCommand | None = None) -> None:
         ends = (station.board, failed.target) if failed else (None, None)

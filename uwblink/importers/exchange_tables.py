@@ -46,7 +46,6 @@ from uwblink.importers.staging import (
     OF_DIFFERENCES,
     SOUND_IDS,
     Condition,
-    Faults,
     StagedRows,
     Staging,
     Watch,
@@ -121,8 +120,8 @@ def import_tables(
     """
     with connected(paths) as db:
         staging = Staging(db, paths, column_map, watch)
-        faults, notes = Faults(staging), _notes(staging)
-        rows, reading = _usable(staging, faults, notes, watch)
+        _note_assumptions(staging)
+        rows, reading = _usable(staging)
         total, done = rows.count(), 0
         delays = column_map.antenna_delays
         if reading and reading.undelayed:
@@ -159,7 +158,7 @@ def import_tables(
             for table, found in staging.beside.items():
                 recording.append(table, found)
             first = ""
-            for some in faults:
+            for some in staging.faults:
                 first = first or some[0].detail
                 recording.append("faults", some)
             counts = {
@@ -168,9 +167,11 @@ def import_tables(
             }
             if first:
                 lost = counts["faults"]
-                notes.append(f"{lost} of {total + lost} rows are unusable and stored as faults; the first: {first}")
-            recording.append_meta({"notes": notes})
-        return Imported({name: n for name, n in counts.items() if n or name == "exchanges"}, notes)
+                staging.notes.append(
+                    f"{lost} of {total + lost} rows are unusable and stored as faults; the first: {first}"
+                )
+            recording.append_meta({"notes": staging.notes})
+        return Imported({name: n for name, n in counts.items() if n or name == "exchanges"}, staging.notes)
 
 
 def _other_rows(exchanges: Exchanges, block: Columns) -> Iterator[tuple[str, Columns]]:
@@ -186,28 +187,27 @@ def _other_rows(exchanges: Exchanges, block: Columns) -> Iterator[tuple[str, Col
             yield "temperature", {kept: column[np.isfinite(block[name])] for kept, column in read.items()}
 
 
-def _notes(staging: Staging) -> list[str]:
-    notes, names = [], staging.names
-    if names:
+def _note_assumptions(staging: Staging) -> None:
+    """Add notes on ids that are words, on rows without a range, and on times that are assumed."""
+    if names := staging.names:
         # The first dozen; the recording has all, as bodies of its tags.
         some = first_few((f"{name[:20]} = {number}" for number, name in names.items()), 12)
-        notes.append(f"{len(names)} ids are words or too large, and were numbered: {some}")
+        staging.notes.append(f"{len(names)} ids are words or too large, and were numbered: {some}")
     if staging.blanks:
         total = staging.offsets[-1]
-        notes.append(f"{staging.blanks} of {total} rows or cells have no range, and are left out")
+        staging.notes.append(f"{staging.blanks} of {total} rows or cells have no range, and are left out")
     if not staging.rows.has("time_s"):
         rows = "rows are assumed to be one millisecond apart, in their order"
         timed = "frames are timed by their stamps" if staging.column_map.layout == "broadcasts" else rows
-        notes.append(f"there are no times; {timed}")
-    return notes
+        staging.notes.append(f"there are no times; {timed}")
 
 
-def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) -> tuple[StagedRows, Reading | None]:
-    """Return the usable exchanges and the reading of their stamps, None for ranges without stamps; adds to the notes.
+def _usable(staging: Staging) -> tuple[StagedRows, Reading | None]:
+    """Return the usable exchanges and the reading of their stamps, None for ranges without stamps; adds notes.
 
     Raises `ImportTableError` if half of the rows or more are unusable.
     """
-    column_map, path = staging.column_map, staging.paths[0]
+    column_map, path, faults, notes = staging.column_map, staging.paths[0], staging.faults, staging.notes
     if (back := rows_back(staging.rows))[0]:
         # Rows of one log are out of order by less; each of several files restarts the time.
         more = (
@@ -217,16 +217,16 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
         notes.append(f"{back[0]} rows are earlier than the row before, and are sorted by time{more}")
     layout, protocol = column_map.layout or _layout(staging), column_map.protocol
     if layout == "broadcasts":
-        rows, protocol = broadcast_exchanges(staging, faults, notes)
+        rows, protocol = broadcast_exchanges(staging)
     elif layout in ("messages", "stamps", "parts"):
-        rows, found = assemble_exchanges(staging, layout, faults, watch)
+        rows, found = assemble_exchanges(staging, layout)
         protocol = protocol or found
     else:
         rows = faults.reject(staging.rows, SOUND_IDS)
     if layout not in ("exchanges", "ranges", "parts") and any(map(staging.rows.has, TEMPERATURES)):
         notes.append(f"temperatures are only read if a row is an exchange, not with layout {layout}")
     total = rows.count() + len(faults)
-    watch("checking", 0.0)
+    staging.watch("checking", 0.0)
     value = {"ranges": "range_m", "differences": "difference_m"}.get(layout)
     notes += staging.words_in(
         name for name in (*DISTANCES, *POWERS, *SKEWS, *TEMPERATURES, *_BESIDE["quality"]) if name != value
@@ -249,7 +249,7 @@ def _usable(staging: Staging, faults: Faults, notes: list[str], watch: Watch) ->
         return rows, None
     protocol = protocol or ("ds" if rows.has("tx3") and rows.has("rx3") else "ss")
     staging.require(rows, stamps_of(protocol))
-    rows, repeats, bits, counter = usable_exchanges(staging, rows, faults, stamps_of(protocol))
+    rows, repeats, bits, counter = usable_exchanges(staging, rows, stamps_of(protocol))
     faults.check(total)
     if repeats:
         notes.append(
@@ -331,6 +331,6 @@ def _without_repeats(rows: StagedRows) -> tuple[StagedRows, str]:
     rows.db.execute(
         f"CREATE TABLE repeats AS SELECT row FROM ({gaps}) WHERE equal AND turned AND gap_ms < {others / 2!r}"
     )
-    (merged,) = StagedRows(rows.db, "repeats", ()).values("count(*)")
+    merged = StagedRows(rows.db, "repeats", ()).count()
     kept = rows.where("rowid NOT IN (SELECT row FROM repeats)")
     return kept, f"{merged} {text}, as logged by the other device, and are left out"

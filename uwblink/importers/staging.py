@@ -119,7 +119,8 @@ class Staging:
     """Tables staged as one; `rows` are their rows.
 
     `names` are the words for ids, by assigned number; `offsets` are the numbers of each table's first row among all
-    rows, and the number of all rows.
+    rows, and the number of all rows. `faults` are the rows that proved unusable, `notes` lines for the user, and
+    `watch` is called with the progress.
     """
 
     def __init__(
@@ -129,8 +130,9 @@ class Staging:
 
         Raises `ImportTableError`.
         """
-        self.db, self.paths, self.column_map = db, tuple(paths), column_map
+        self.db, self.paths, self.column_map, self.watch = db, tuple(paths), column_map, watch
         self.tables: list[SourceTable] = []
+        self.notes: list[str] = []
         self.names: dict[int, str] = {}
         self.offsets = [0]
         columns: Collection[str] = ()
@@ -159,6 +161,7 @@ class Staging:
         db.execute(f"CREATE TABLE rows AS SELECT {listed} FROM staged WHERE {self._filled}")
         db.execute("DROP TABLE staged")
         self.rows = StagedRows(db, "rows", ("origin", *(n for n in ALL_IDS if n in columns), *others))
+        self.faults = Faults(self)
 
     def words_in(self, names: Iterable[str]) -> Iterator[str]:
         """Yield a note for each of some columns with cells that are not numbers, which are treated as missing.
@@ -377,7 +380,7 @@ class Faults:
 
     def __len__(self) -> int:
         """Return the number of unusable rows, without those with too many cells."""
-        return int(self._staging.db.execute("SELECT count(*) FROM faulty").fetchall()[0][0])
+        return StagedRows(self._staging.db, "faulty", ()).count()
 
     def __iter__(self) -> Iterator[list[Fault]]:
         """Yield blocks of faults: for each file in the order of rows, then rows with too many cells."""
@@ -426,9 +429,7 @@ def time_conditions(rows: StagedRows) -> list[Condition]:
     return [Condition("time_s", "a time", "time_ns IS NULL")] if rows.has("time_s") else []
 
 
-def usable_exchanges(
-    staging: Staging, rows: StagedRows, faults: Faults, stamps: Sequence[str]
-) -> tuple[StagedRows, int, int, str]:
+def usable_exchanges(staging: Staging, rows: StagedRows, stamps: Sequence[str]) -> tuple[StagedRows, int, int, str]:
     """Return the rows that have all stamps, without repetitions of an exchange.
 
     Also returns the number of repetitions, and width and format of the counter.
@@ -445,17 +446,17 @@ def usable_exchanges(
             value, high = f"{name} * CAST('{scale!r}' AS DOUBLE)" if scale != 1.0 else name, low + (1 << bits)
             wrong = f"{value} < {low} OR {value} >= {high}"
             conditions.append(Condition(name, f"{expected} from {low} to {high - 1}", wrong))
-    good = faults.reject(rows, conditions)
+    good = staging.faults.reject(rows, conditions)
     # Two of 10 million different exchanges have the same hash of 64 bits once in 400,000 tables.
     some = good.where(" OR ".join(f"{name} <> 0" for name in stamps))
     number = f"row_number() OVER (PARTITION BY hash({', '.join([*IDS, *stamps])}) ORDER BY rowid)"
     later = f"SELECT rowid FROM {rows.name} WHERE {some.condition} QUALIFY {number} > 1"
     staging.db.execute(f"CREATE TABLE repeats AS {later}")
-    (repeats,) = StagedRows(staging.db, "repeats", ()).values("count(*)")
+    repeats = StagedRows(staging.db, "repeats", ()).count()
     return good.where("rowid NOT IN (SELECT rowid FROM repeats)") if repeats else good, repeats, bits, counter
 
 
-def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Watch) -> tuple[StagedRows, str | None]:
+def assemble_exchanges(staging: Staging, layout: str) -> tuple[StagedRows, str | None]:
     """Combine rows of "messages", "stamps" or "parts" into exchanges.
 
     Returns complete exchanges, and the protocol, if the rows determine it. Incomplete exchanges are faults. Messages
@@ -464,8 +465,8 @@ def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Wat
     """
     rows, of_messages = staging.rows, layout != "parts"
     staging.require(rows, {"messages": ("tx", "rx"), "stamps": ("stamp", "event", "message")}.get(layout, ()))
-    watch("sorting", 0.0)
-    rows = faults.reject(rows, SOUND_IDS)
+    staging.watch("sorting", 0.0)
+    rows = staging.faults.reject(rows, SOUND_IDS)
     message, follows = "place", ""
     if of_messages and rows.has("message"):
         some, zeros, largest = rows.values("count(message), count(*) FILTER (message = 0), max(message)")
@@ -498,23 +499,23 @@ def assemble_exchanges(staging: Staging, layout: str, faults: Faults, watch: Wat
     values |= {n: f"coalesce(arg_min({n}, serial) FILTER ({first}), any_value({n}) FILTER (first))" for n in IDS}
     values |= {name: f"max({cell}) FILTER ({where})" for name, (cell, where) in cells.items()}
     values |= {"conflict": " OR ".join(twice) or "false"}
-    watch("grouping", 0.0)
+    staging.watch("grouping", 0.0)
     groups = _group(rows, values, follows, staging.column_map.within_s)
     conflict = Condition("event" if layout == "stamps" else "sequence", "one value of each stamp", "conflict")
     columns = tuple(name for name in values if name != "conflict" and not name.startswith("sender"))
     if not of_messages:
-        return replace(faults.reject(groups, [conflict]), columns=columns), None
+        return replace(staging.faults.reject(groups, [conflict]), columns=columns), None
     second, third, by_initiator = groups.values("count(sender2), count(sender3), count(*) FILTER (sender3 = from_id)")
     protocol = "ss" if 2 * third <= second else "ds-alt" if 2 * by_initiator > third else "ds"
     senders = ["from_id", "to_id", *({"ds": ["to_id"], "ds-alt": ["from_id"]}.get(protocol, []))]
     whole = " AND ".join(f"coalesce(sender{n} = {sender}, false)" for n, sender in enumerate(senders, start=1))
     incomplete = Condition("message", "messages 1, 2 (and 3) of one exchange", f"NOT ({whole})")
     columns = tuple(name for name in columns if protocol != "ss" or name not in ("tx3", "rx3"))
-    return replace(faults.reject(groups, [incomplete, conflict]), columns=columns), protocol
+    return replace(staging.faults.reject(groups, [incomplete, conflict]), columns=columns), protocol
 
 
-def broadcast_exchanges(staging: Staging, faults: Faults, notes: list[str]) -> tuple[StagedRows, str]:
-    """Return the exchanges in broadcasts whose senders list receptions, and their protocol; adds to notes.
+def broadcast_exchanges(staging: Staging) -> tuple[StagedRows, str]:
+    """Return the exchanges in broadcasts whose senders list receptions, and their protocol.
 
     Adds the receptions, and overheard exchanges of third tags, to the other rows. Raises `ImportTableError`.
     """
@@ -522,7 +523,7 @@ def broadcast_exchanges(staging: Staging, faults: Faults, notes: list[str]) -> t
     if staging.column_map.factor("tx") != 1.0:
         raise ImportTableError(f"{staging.paths[0]}: units.stamps: broadcasts need ticks")
     whole = [Condition(name, "a whole number", f"{name} IS NULL") for name in ("tx", "rx", "sequence", "heard")]
-    rows = faults.reject(staging.rows, [*SOUND_IDS, *time_conditions(staging.rows), *whole])
+    rows = staging.faults.reject(staging.rows, [*SOUND_IDS, *time_conditions(staging.rows), *whole])
     sample, db = rows.sample(SAMPLE_ROWS), staging.db
     bits, _ = counter_format((sample[name] for name in ("tx", "rx")), staging.column_map.bits, "wrapped")
     named = "from_id, sequence, tx, min(origin) AS first" + (", min(time_ns) AS time_ns" if rows.has("time_s") else "")
@@ -546,7 +547,7 @@ def broadcast_exchanges(staging: Staging, faults: Faults, notes: list[str]) -> t
             receptions = replace(receptions, time_ns=receptions.time_ns + times_by_stamps(receptions))
         exchanges, overheard = exchanges_in(receptions)
     if wrong := np.count_nonzero(contradicted(receptions)):
-        notes.append(
+        staging.notes.append(
             f"{wrong} of {len(receptions)} receptions are not used, because others of their link contradict them"
         )
     staging.beside = {"receptions": receptions.to_dict(), "overheard": overheard}

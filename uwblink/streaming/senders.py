@@ -18,13 +18,12 @@ import secrets
 import select
 import socket
 import socketserver
-import sys
-import threading
 from functools import cache
-from http.client import HTTPException, parse_headers
+from http.client import parse_headers
 from typing import Any, Final
 from urllib.parse import urlsplit
 
+from uwblink.boards.live_page import BackgroundServer
 from uwblink.boards.ports import Closing
 from uwblink.errors import ArgumentError, PortError, raising
 from uwblink.exporters.mcap import RANGE, SCHEMAS, stamped
@@ -59,28 +58,17 @@ def is_viewer(host: str, origin: str | None, own: str) -> bool:
     return bool(name) and is_own and (origin is None or (is_trusted if is_page else bool(site.scheme)))
 
 
-class Gate(socketserver.ThreadingTCPServer):
-    """Serves at `host` and `port`, 0 for a free one, and passes viewers on to `inner`; raises `OSError`."""
+class Gate(BackgroundServer):
+    """Serves at `host` and `port`, 0 for a free one, and passes viewers on to `inner`; raises `OSError`.
 
-    allow_reuse_address = True
-    daemon_threads = True
+    Connections end with the server behind.
+    """
 
     def __init__(self, host: str, port: int, inner: tuple[str, int]) -> None:
-        """Begin to serve, in a thread."""
+        """Begin to serve."""
         self.address_family, _, _, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         self.host, self.inner = host, inner
-        super().__init__(place, _Request)  # type: ignore[arg-type]
-        threading.Thread(target=self.serve_forever, name="uwblink gate", daemon=True).start()
-
-    def close(self) -> None:
-        """End; connections end with the server behind."""
-        self.shutdown()
-        self.server_close()
-
-    def handle_error(self, request: object, client_address: object) -> None:
-        """Ignore lost connections."""
-        if not isinstance(sys.exception(), OSError | HTTPException):
-            super().handle_error(request, client_address)  # type: ignore[arg-type]
+        super().__init__(place, _Request)
 
 
 class _Request(socketserver.StreamRequestHandler):

@@ -39,7 +39,7 @@ from uwblink.receptions import exchange_of
 from uwblink.recording.file import Recording
 from uwblink.twr import Exchanges
 from uwblink.wire.codec import exchanges_of
-from uwblink.wire.messages import Overheard, RangeReport
+from uwblink.wire.messages import Overheard
 
 Stream = Generator["StreamedRange | StreamedDifference", None, None]
 
@@ -162,19 +162,7 @@ def stream(  # noqa: PLR0913 - options by name
     range. Closing the iterator closes the ports.
 
     >>> import uwblink, uwbsim
-    >>> ports = uwbsim.VirtualPorts(
-    ...     uwbsim.load(
-    ...         '''
-    ...         run = { duration_s = 10.0 }
-    ...         ranging = { rate_hz = 50 }
-    ...         bodies = [
-    ...             { name = "near", motion = { model = "static", position_m = [0.0, 0.0, 1.0] } },
-    ...             { name = "far", motion = { model = "static", position_m = [3.0, 0.0, 1.0] } },
-    ...         ]
-    ...         tags = [{ id = 10, body = "near" }, { id = 20, body = "far" }]
-    ...         '''
-    ...     )
-    ... )
+    >>> ports = uwbsim.VirtualPorts(uwbsim.load("two_boards_on_a_bench/bench"))
     >>> ranges = [one.range_m for one in uwblink.stream(ports.names.values(), duration_s=1.0, using=ports)]
     >>> all(abs(found - 3.0) < 1.0 for found in ranges)
     True
@@ -232,19 +220,7 @@ class RangeListener(Listener):
 
     >>> import uwblink, uwbsim
     >>> from uwblink.streaming import RangeListener
-    >>> ports = uwbsim.VirtualPorts(
-    ...     uwbsim.load(
-    ...         '''
-    ...         run = { duration_s = 10.0 }
-    ...         ranging = { rate_hz = 50 }
-    ...         bodies = [
-    ...             { name = "near", motion = { model = "static", position_m = [0.0, 0.0, 1.0] } },
-    ...             { name = "far", motion = { model = "static", position_m = [3.0, 0.0, 1.0] } },
-    ...         ]
-    ...         tags = [{ id = 10, body = "near" }, { id = 20, body = "far" }]
-    ...         '''
-    ...     )
-    ... )
+    >>> ports = uwbsim.VirtualPorts(uwbsim.load("two_boards_on_a_bench/bench"))
     >>> ranges = []
     >>> plan, told = uwblink.RangingPlan(rate_hz=20.0), [RangeListener(ranges.append)]
     >>> done = uwblink.record(ports.names.values(), "f.uwb", plan, duration_s=1.0, using=ports, listeners=told)
@@ -263,7 +239,6 @@ class RangeListener(Listener):
         With `use` "receptions" also with each `StreamedDifference` of boards that listen.
         """
         self._callback, self._correct = callback, None if calibration is None else load_correction(calibration)
-        self._came_ns: dict[int, int] = {}
         self._last: Exchanges | None = None
         # Boards that overhear may print before the one that reports; those of a few exchanges are kept.
         self._overheard = deque[dict[str, Any]](maxlen=100 * _check_use(use, self._correct))
@@ -273,19 +248,15 @@ class RangeListener(Listener):
         check_pairs(self._correct, pairs)
 
     def on_message(self, heard: Heard) -> None:
-        """Store the time of a report."""
-        if isinstance(heard.message, RangeReport):
-            self._came_ns[heard.board] = heard.time_ns
-        elif isinstance(heard.message, Overheard):
+        """Call the function with the difference of arrival, if the exchange is the last one."""
+        if isinstance(heard.message, Overheard):
             self._overheard.append(overheard_row(heard.time_ns, heard.board, heard.message))
             self._tell_differences()
 
     def on_turn(self, turn: Turn) -> None:
         """Call the function with the range of a turn, whose time is that of its poll, as in recordings."""
         if turn.report is not None:
-            initiator = turn.pair[0]
-            came_ns = self._came_ns.get(initiator, turn.time_ns)
-            self._last = exchanges_of([(came_ns, initiator, turn.report)])
+            self._last = exchanges_of([(turn.time_ns, turn.pair[0], turn.report)])
             for found in streamed(self._last, self._correct):
                 self._callback(found)
             self._tell_differences()

@@ -149,7 +149,7 @@ class LivePoses:
         draws = {name: stream(seed, "live motion capture gaps", name) for name in world.trajectories}
         waits = {name: np.cumsum(rng.exponential(60 / per_min, len(numbers))) for name, rng in draws.items()}
         self._gaps_s = {name: wait + numbers * mocap.gap_s for name, wait in waits.items()}
-        self._file = new_file(path, force=True)
+        self._file = new_file(path)
         self._file.write("time_ns,body,x,y,z,qx,qy,qz,qw\n")
         self._file.flush()
 
