@@ -66,7 +66,7 @@ class Finding:
 
 REMEDIES: Final = {
     # Unknowns that the data do not determine.
-    "undetermined delays": "ranges among three of these tags, or a known delay (`fixed_ns`), would determine the rest",
+    "undetermined delays": "record ranges among three of these tags, or state a known delay (`fixed_ns`)",
     "undetermined pattern over direction": "record a flight in which the robot makes a full turn at several places",
     "undetermined slope over temperature": "record while the boards warm up",
     "pattern or effect of power": "compare with a fit with `pattern` none and `groups` of tags",

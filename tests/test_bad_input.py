@@ -323,8 +323,7 @@ def test_a_second_server_does_not_take_the_links_of_the_first(tmp_path):
 @pytest.fixture
 def numbered(tmp_path, monkeypatch):
     """Pseudo-terminals with the names pts0, pts1 ..., as the system gives the smallest names that are free."""
-    real = pty.openpty
-    devices: dict[int, str] = {}
+    real, devices = pty.openpty, dict[int, str]()
 
     def openpty():
         ends = real()

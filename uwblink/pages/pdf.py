@@ -32,9 +32,6 @@ TEXT_WIDTH: Final = 72 * WIDTHS["page"]
 SMALL: Final = 8.0
 """Font size of tables, notes, captions and figures."""
 
-LISTING_COLUMNS: Final = int((TEXT_WIDTH - 10) / (0.602 * SMALL))
-"""Characters in a line of a listing: those of DejaVu Sans Mono are 0.602 font sizes wide."""
-
 FILLS: Final = {
     "lead": "#f3f5f7",
     "warning": "#fff4e0",
@@ -122,7 +119,9 @@ def _story(document: Document, heights: Mapping[str, float], places: list[Place]
                 large = f'<font size="13"><b>{large}</b></font><br/>' if large else ""
                 together.append(_text(large + rest, SMALL if kind == "note" else 9.5, FILLS.get(kind)))
             case Listing(text):
-                broken = (wrap(line, LISTING_COLUMNS, drop_whitespace=False) or [""] for line in text.split("\n"))
+                # Characters of DejaVu Sans Mono are 0.602 font sizes wide.
+                columns = int((TEXT_WIDTH - 10) / (0.602 * SMALL))
+                broken = (wrap(line, columns, drop_whitespace=False) or [""] for line in text.split("\n"))
                 lines = "\n".join(chain.from_iterable(broken))
                 together.append(_text(escape(lines), SMALL, FILLS["lead"], XPreformatted, fontName="mono"))
             case Picture(name):

@@ -247,10 +247,6 @@ def _draw_spans(axes: Axes, protocol: RangingProtocol, stamps_us: Mapping[str, f
         axes.annotate(text, place, away, textcoords="offset points", **upright)
 
 
-MAX_NUMBERS = 8
-"""Columns of a map up to which its cells hold numbers of three digits: so many fit beside each other."""
-
-
 def result_over_keys(
     width_in: float, keys: Mapping[str, Sequence[Any]], protocol: Sequence[str], result: Floats, name: str
 ) -> Figure:
@@ -312,12 +308,14 @@ def _maps(
         binned_statistic_2d(row[rows[one]], column[rows[one]], result[rows[one]], "median", cells).statistic
         for one in protocols
     ]
+    # With up to eight columns, numbers of three digits fit beside each other.
+    most_columns = 8
     for axes, protocol, values in zip(panels, protocols, shown, strict=True):
         low, high = float(np.nanmin(values)), float(np.nanmax(values))
         # "cividis" grows lighter evenly, and alike for all eyes; values alike within a tenth do not span all of it.
         high = max(high, low + 0.1 * abs(low))
         axes.pcolormesh(cells[1], cells[0], values, cmap="cividis", vmin=low, vmax=high)
-        for (up, right), value in np.ndenumerate(values if values.shape[1] <= MAX_NUMBERS else values[:0]):
+        for (up, right), value in np.ndenumerate(values if values.shape[1] <= most_columns else values[:0]):
             colour = "white" if value < (low + high) / 2 else "black"
             axes.text(right, up, three_digits(value).replace("-", "−"), ha="center", va="center", color=colour)
         for axis, own in ((axes.xaxis, x), (axes.yaxis, y)):

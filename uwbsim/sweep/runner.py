@@ -258,14 +258,15 @@ class ResultStore:
                     yield row
 
 
-UNUSABLE: Final = (duckdb.Error, ValueError, TypeError, KeyError, RecursionError)
-"""Errors of a store whose file is damaged, or cannot be written."""
-
-
 def _reading(path: Path) -> AbstractContextManager[None]:
-    return raising(TableError, f"{path}: its results are damaged", *UNUSABLE, remedy="; begin in another folder")
+    return _using(path, "its results are damaged", "; begin in another folder")
 
 
 def _writing(path: Path) -> AbstractContextManager[None]:
-    remedy = "; is the disk full? Results so far are kept"
-    return raising(TableError, f"{path}: cannot be written", *UNUSABLE, remedy=remedy)
+    return _using(path, "cannot be written", "; is the disk full? Results so far are kept")
+
+
+def _using(path: Path, wrong: str, remedy: str) -> AbstractContextManager[None]:
+    """Raise `TableError` for the errors of a store whose file is damaged, or cannot be written."""
+    unusable = (duckdb.Error, ValueError, TypeError, KeyError, RecursionError)
+    return raising(TableError, f"{path}: {wrong}", *unusable, remedy=remedy)
