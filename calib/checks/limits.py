@@ -85,7 +85,7 @@ def _without_curve(found: KnownDistances, ranges: Ranges, residuals_m: Floats) -
     known = np.isfinite(lifted)
     if not known.any():
         return warning(
-            "no curve",
+            "no powers",
             "delays only, without any power: the effect of power is unknown and contained in delays and errors, so "
             "delays from other distances will differ",
         )

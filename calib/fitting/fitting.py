@@ -188,7 +188,7 @@ def add_tag(data: Data | Iterable[Data], calibration: CalibrationSource, tag: in
         ranges=some,
         # The curve is known, and was taken off before.
         findings=[
-            *[one for one in found.findings if one.fault != "no curve"],
+            *[one for one in found.findings if one.fault not in ("no curve", "no powers")],
             *([unshared] if len(joined.patterns) > len(calibration.patterns) else []),
         ],
     )

@@ -249,6 +249,7 @@ class Terminal:
             raise PortError("this system has no pseudo-terminals; use Linux or macOS")
         self._link = link
         self._ends: tuple[int, int] | None = None
+        self.lost_bytes = 0
         self.plug()
 
     @property
@@ -295,10 +296,11 @@ class Terminal:
         return b""
 
     def write(self, data: bytes) -> None:
-        """Send bytes in one piece; bytes that do not fit are lost."""
-        if self._ends:
-            with contextlib.suppress(OSError):
-                os.write(self._ends[0], data)
+        """Send bytes in one piece; bytes that do not fit are lost and counted."""
+        sent = 0
+        with contextlib.suppress(OSError):
+            sent = os.write(self._ends[0], data) if self._ends else 0
+        self.lost_bytes += len(data) - sent
 
 
 def open_terminals(links: Mapping[Key, Path | None]) -> dict[Key, Terminal]:
