@@ -202,13 +202,14 @@ def for_provenance(findings: Iterable[Finding]) -> dict[str, Any]:
 def contradictions_in(provenance: Mapping[str, Any]) -> list[str]:
     """Return the sentences of the findings in a calibration that have a p-value, so that they are no mere limits.
 
-    Calibrations from before 0.3 have the sentences themselves as findings.
+    Calibrations from before 0.3 have the sentences themselves as findings. Raises `AttributeError`, `TypeError` and
+    `ValueError` for entries that no version writes.
     """
     found = list(provenance.get("findings", []))
     if all(isinstance(one, str) for one in found):
         return found
-    texts = map(str, provenance.get("warnings", []))
-    return [text for text, one in zip(texts, found, strict=False) if one.get("p_value") is not None]
+    rows = zip(provenance["warnings"], found, strict=True)
+    return [str(text) for text, one in rows if one.get("p_value") is not None]
 
 
 def exceeds(value: float, std: float, dof: float, *, tolerance: float = 0.0, tried: float = 1) -> float:

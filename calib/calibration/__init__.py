@@ -10,6 +10,7 @@ from calib.calibration.model import (
     pair_rows,
     pattern_rows,
     temperature_rows,
+    warnings_of,
 )
 
 __all__ = [
@@ -25,4 +26,5 @@ __all__ = [
     "programmed",
     "read_miluv",
     "temperature_rows",
+    "warnings_of",
 ]

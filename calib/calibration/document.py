@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Annotated, Any, Final, TypeVar
 
 from pydantic import (
@@ -22,6 +23,7 @@ from pydantic_core import ErrorDetails
 from calib.data.ranges import MAX_RANGE_M
 from calib.errors import BadInputError
 from uwblink.display import first_few
+from uwblink.errors import raising
 from uwblink.text_files import FileKey
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import LARGEST_ID
@@ -381,6 +383,17 @@ def _explained(errors: list[ErrorDetails]) -> str:
     message = "missing" if first["type"] == "missing" else first["msg"].removeprefix("Value error, ")
     found = "" if isinstance(first["input"], dict) else f"found {first['input']!r:.60}, "
     return ": ".join([*(path[:-2] if path[-1:] == ["[key]"] else path), found + message])
+
+
+@contextmanager
+def reading_provenance() -> Iterator[None]:
+    """Raise `BadInputError` for damaged entries of a provenance, as a context or as a decorator of a function.
+
+    A provenance is information for people, so entries are only checked where one is used.
+    """
+    wrong = "calibration: its provenance is not as uwbcal writes it"
+    with raising(BadInputError, wrong, AttributeError, KeyError, TypeError, ValueError):
+        yield
 
 
 def for_json(value: Any) -> Any:

@@ -40,6 +40,7 @@ from calib.calibration.document import (
     one_of,
     pair_name,
     read,
+    reading_provenance,
     write,
 )
 from calib.calibration.error_model import CheckedErrors
@@ -619,6 +620,12 @@ def known_facts(provenance: Mapping[str, Any]) -> str:
         f"standard error of the distances: {100 * off:.1f} cm" if isinstance(off, int | float) else "",
     ]
     return ", ".join(filter(None, parts))
+
+
+@reading_provenance()
+def warnings_of(calibration: Calibration) -> list[str]:
+    """Return the warnings of the fit, as sentences."""
+    return list(map(str, calibration.provenance.get("warnings", [])))
 
 
 def held_out_line(calibration: Calibration) -> str:

@@ -272,7 +272,7 @@ def show(
         *([f"distances: {distances}"] if distances else _survey_lines(provenance.get("rests_on"))),
         *([f"age: {age}"] if (age := calib.calibration.age_line(known)) else []),
     ]
-    warnings = (f"warning: {with_flags(str(text))}" for text in provenance.get("warnings", []))
+    warnings = (f"warning: {with_flags(text)}" for text in calib.calibration.warnings_of(known))
     typer.echo("\n".join([repr(known), *(f"  {line}" for line in lines), *warnings]))
 
 
@@ -286,7 +286,8 @@ def _survey_lines(facts: object) -> Iterator[str]:
     """Yield lines on the known facts of a survey: arrangements by known shape, known distances and positions."""
     if not isinstance(facts, dict):
         return
-    rows = [row for row in facts.get("arrangements", []) if isinstance(row, dict)]
+    listed = facts.get("arrangements")
+    rows = [row for row in listed if isinstance(row, dict)] if isinstance(listed, list) else []
     for shape in dict.fromkeys(str(row.get("known", "")) for row in rows):
         names = ", ".join(str(row.get("name")) for row in rows if row.get("known", "") == shape)
         yield f"rests on arrangements {names}{f', on a {shape}' if shape else ''}"

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from calib.calibration.applying import heard_receptions, keep_determined, noise_m, reception_gains
-from calib.calibration.document import for_json
+from calib.calibration.document import for_json, reading_provenance
 from calib.calibration.error_model import GATE
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration, interval
 from calib.data.ranges import Ranges
@@ -296,7 +296,8 @@ def fixed_std(calibration: Calibration, settings: Settings, training: Data | Fli
         return FixedStd(dict.fromkeys(("raw", "calibrated"), settings.fixed_std_m), "given")
     known = calibration.provenance.get("error_std_m")
     if training is None and isinstance(known, dict) and {"raw", "corrected"} <= set(known):
-        std = {"raw": float(known["raw"]), "calibrated": float(known["corrected"])}
+        with reading_provenance():
+            std = {"raw": float(known["raw"]), "calibrated": float(known["corrected"])}
         return FixedStd(std, "from the fitted errors")
     if training is None:
         middle = float(calibration.sigma_curve(np.array([np.mean(calibration.sigma_curve.range)]))[0])

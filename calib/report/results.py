@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 
 from calib.calibration.applying import CorrectedRanges
-from calib.calibration.model import Calibration
+from calib.calibration.model import Calibration, warnings_of
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data
 from calib.evaluation.localization import Localization
@@ -78,7 +78,7 @@ class Results:
     @property
     def warnings(self) -> list[str]:
         """The warnings of the fit, from its calibration."""
-        return list(map(str, self.calibration.provenance.get("warnings", [])))
+        return warnings_of(self.calibration)
 
     @property
     def recordings(self) -> list[Ranges]:

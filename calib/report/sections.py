@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from calib import figures
-from calib.calibration.document import pair_name
+from calib.calibration.document import pair_name, reading_provenance
 from calib.calibration.model import known_facts
 from calib.calibration.model import pair_rows as offset_rows
 from calib.errors import BadInputError
@@ -110,6 +110,7 @@ def _recordings(results: Results) -> list[Block]:
     return [Heading("What was recorded"), Table(header, rows)]
 
 
+@reading_provenance()
 def _foundations(results: Results) -> list[Block]:
     """Return the facts that a fit used instead of known distances; an empty list if distances were known."""
     provenance = results.calibration.provenance

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import stdtrit
 from scipy.stats import binomtest
 
-from calib.calibration.document import pair_name, split_text
+from calib.calibration.document import pair_name, reading_provenance, split_text
 from calib.calibration.model import known_facts
 from calib.estimator.range_model import METRES_A_NS
 from calib.evaluation.statistics import Stats
@@ -74,7 +74,9 @@ def criteria(results: Results) -> Iterator[Criterion]:
     if results.recordings:
         yield from _of_uses(results)
     if made.get("recipe") == "survey":
-        yield from _of_survey(results)
+        with reading_provenance():
+            found = list(_of_survey(results))
+        yield from found
     elif known_facts(made) and isinstance(std_m := made.get("distance_std_m"), int | float):
         yield _distances(std_m)
     if results.recordings:
@@ -211,6 +213,7 @@ def _settled(results: Results) -> Criterion:
     return Criterion(*head, f"widest: {widest}, ± {half[widest]:.3f} ns", grade, summary)
 
 
+@reading_provenance()
 def undetermined_delays(results: Results) -> str:
     """Return a text on the delays that the pairs do not determine, "" without any."""
     made, splits = results.calibration.provenance, results.calibration.undetermined_splits

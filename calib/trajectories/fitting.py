@@ -11,7 +11,7 @@ import numpy as np
 from scipy import sparse, special
 from threadpoolctl import threadpool_limits
 
-from calib.calibration.document import Split
+from calib.calibration.document import Split, reading_provenance
 from calib.calibration.model import Calibration, given_calibration, matrix_of
 from calib.calibration.power_curves import basis
 from calib.checks.fitted import examine_fit
@@ -121,7 +121,8 @@ def _settings(
     if known.groups or known.power_at != "exchange":
         what = "curves of groups of tags" if known.groups else "a curve of each reception"
         raise BadInputError(f"has {what}, expected one curve of all exchanges", parameter="curve_from")
-    reference = known.provenance.get("reference_power_dbm", known.alpha_dbm)
+    with reading_provenance():
+        reference = float(known.provenance.get("reference_power_dbm", known.alpha_dbm))
     kept = replace(settings, lift=known.lift, alpha_dbm=known.alpha_dbm, reference_power_dbm=reference)
     return flight, kept, known
 

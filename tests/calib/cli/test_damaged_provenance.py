@@ -1,0 +1,54 @@
+"""Calibrations whose provenance is damaged: one line and status 2, or everything that does not need the entry."""
+
+import json
+import operator
+
+import pytest
+
+import calib
+from tests import processes
+
+
+@pytest.fixture(scope="module")
+def surveyed(tmp_path_factory):
+    """Return a recording and the document of a survey of its tags."""
+    folder = tmp_path_factory.mktemp("surveyed")
+    assert processes.run("calib", "sample", "-o", folder / "a.uwb", "-n", "900").returncode == 0
+    found = calib.survey(calib.sample_arrangements(), known="line").calibration
+    return folder / "a.uwb", json.loads(found.to_json())
+
+
+@pytest.mark.parametrize(
+    ("entry", "value"),
+    [
+        (("rests_on",), None),
+        (("rests_on", "freedom"), "many"),
+        (("rests_on", "arrangements"), 3),
+        (("pairs",), None),
+        (("warnings",), 3),
+        (("findings",), [1, "x"]),
+        (("findings",), 3),
+        (("reflected",), [{"chance": "high"}]),
+        (("surveyed",), [{"name": 1}]),
+        (("undetermined",), [3]),
+        (("second_best",), "none"),
+    ],
+    ids=str,
+)
+def test_a_damaged_entry_is_one_line_where_it_is_used(surveyed, tmp_path, entry, value):
+    recording, document = surveyed
+    changed = json.loads(json.dumps(document))
+    table = changed["provenance"]
+    for key in entry[:-1]:
+        table = operator.getitem(table, key)
+    table[entry[-1]] = value
+    (tmp_path / "c.json").write_text(json.dumps(changed))
+    page = tmp_path / "r.html"
+    judged = processes.run("calib", "evaluate", recording, "-c", tmp_path / "c.json", "--report", page)
+    shown = processes.run("calib", "show", tmp_path / "c.json")
+    for done in (judged, shown):
+        assert "Traceback" not in done.stderr
+        assert done.returncode in (0, 2)
+        if done.returncode:
+            assert "its provenance is not as uwbcal writes it" in " ".join(done.stderr.split())
+    assert page.exists() == (judged.returncode == 0)
