@@ -20,8 +20,8 @@ from calib.findings import BUDGET, FIT_LEVELS, SMALLEST_NS, Finding, warning
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 
-WIDENING_DEVIATION, CERTAIN_DEVIATION = (-float(special.ndtri(share)) for share in (BUDGET, FIT_LEVELS["places"]))
-"""Deviations that at most these shares of sound flights have: the first widens intervals, the second is reported."""
+WIDENING_DEVIATION = -float(special.ndtri(BUDGET))
+"""Deviation of one of the three statistics from which intervals are widened; 1 % of sound flights exceed it."""
 
 
 INFORMATION_LEFT = 0.03
@@ -50,7 +50,7 @@ def place_covariance(
     # The significance of the constant part, as a deviation of one normal value.
     stays = -float(special.ndtri(special.chdtrc(max(len(values), 1), float(values @ values))))
     together = _simultaneous_reflections(found, group)
-    certain = max(deviation, stays) > CERTAIN_DEVIATION
+    certain = _chance(deviation, stays) < FIT_LEVELS["places"]
     if max(deviation, stays, together) <= WIDENING_DEVIATION:
         return nothing
     spread = 1 + reach[:, None] * SIZES_M**2
@@ -69,7 +69,8 @@ def place_covariance(
     # The common part of all delays also depends on the curve, and is far less certain.
     apart = np.eye(len(before_ns2)) - 1 / max(len(before_ns2), 1)
     own, more = (np.diag(apart @ one @ apart) for one in (before_ns2, widening))
-    if max(deviation, stays, together) <= CERTAIN_DEVIATION or not np.any(more > np.maximum(own, SMALLEST_NS**2)):
+    p_value = _chance(deviation, stays, together)
+    if p_value >= FIT_LEVELS["places"] or not np.any(more > np.maximum(own, SMALLEST_NS**2)):
         return widening, []
     near, directions = "as near walls and objects", "pattern" not in found.model.covariates
     wrong = f"reflected together, {near}, and trajectories may have followed them"
@@ -81,8 +82,15 @@ def place_covariance(
         f"are {wrong}, which may change differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals are "
         f"widened for this"
     )
-    p_value = float(special.ndtr(-max(deviation, stays, together)))
     return widening, [warning("errors of places", text, p_value)]
+
+
+def _chance(*deviations: float) -> float:
+    """Return the p-value of the largest of some of the three deviations, by the normal distribution (Bonferroni).
+
+    They are those of the varying part, the constant part, and simultaneous reflections.
+    """
+    return min(1.0, 3 * float(special.ndtr(-max(deviations))))
 
 
 def _deviation_of_mixture(likely: Floats) -> float:

@@ -14,7 +14,7 @@ import uwbsim
 from benchmarks import doctor as planted
 from benchmarks.flights import Flight, Plan, fly
 from calib.checks.examine import CHECKS, FINDING_LEVEL, IMPLIED
-from calib.findings import BUDGET, OF_A_FIT, exceeds
+from calib.findings import BUDGET, CERTAIN, FIT_LEVELS, OF_A_FIT, Candidate, Check, exceeds
 from docs.site import checks
 from tests import processes
 from tests.shared_data import ROOT, rows_of, shared
@@ -38,11 +38,21 @@ def imported(folder, names, rows, settings):
 
 def test_checks_that_involve_chance_share_one_budget_and_the_page_shows_them_all():
     assert sum(not check.certain for check in CHECKS) * FINDING_LEVEL + OF_A_FIT == pytest.approx(BUDGET)
+    assert sum(FIT_LEVELS.values()) == pytest.approx(OF_A_FIT)
     told = Counter(fault for check in CHECKS for fault in check.remedies)
     assert max(told.values()) == 1
     page = checks.reference()
     assert all(f"**{fault}**: " in page for fault in told)
     assert set(IMPLIED).union(*IMPLIED.values(), *(case.expected for case in planted.FAULTS)) <= told.keys()
+
+
+def test_a_candidate_without_p_value_is_a_finding_only_if_no_chance_is_involved():
+    rows = [
+        Check("rows", "?", "count", sound, {"dust": "clean it"}, lambda _: iter(())) for sound in ("normal", CERTAIN)
+    ]
+    chance, certain = (one.findings([Candidate("dust", "grey")], BUDGET) for one in rows)
+    assert chance == []
+    assert [(one.fault, one.p_value) for one in certain] == [("dust", 0.0)]
 
 
 def test_p_values_account_for_the_number_of_tests():

@@ -251,6 +251,11 @@ def test_a_board_that_was_moved_is_named(moved):
     known = calib.Knowledge(shape="line", spans_s={str(k + 1): (70.0 * k, 70.0 * k + 60) for k in range(3)})
     with pytest.raises(calib.UnanswerableError, match=r"^3: board 4 was moved 2\d s after the start"):
         calib.survey(replace(r, raw_m=raw), known=known)
+    (found,) = calib.survey(replace(r, raw_m=raw), known=known, regardless=True).contradictions
+    # Steps of single pairs exceed six standard deviations, and a longer step is less likely by chance.
+    assert found.fault == "board moved within an arrangement"
+    assert found.p_value is not None
+    assert 0 < found.p_value < (1e-6 if moved == 0.10 else 1e-50)
 
 
 def wrong_labels():
@@ -289,7 +294,9 @@ def test_wrong_known_facts_are_named(mistake):
     result = calib.survey(world.ranges, known=known, regardless=True)
     assert [one.fault for one in result.contradictions] == [kind]
     assert re.search(message, result.contradictions[0].evidence)
-    assert 0 <= (result.contradictions[0].p_value or 0) < 0.01
+    chance = result.contradictions[0].p_value
+    assert chance is not None
+    assert 0 <= chance < 0.01
     assert max(map(abs, scores(result, world.delays_ns).values())) < 4
     if kind == "arrangement not as it is said to be":
         assert [one.known for one in result.arrangements] == ["line", "line", "plane", "line", "line"]
