@@ -107,7 +107,7 @@ REMEDIES: Final = {
     "unused known distance": "give an arrangement or its seconds",
     "second solution": "use anchors that are not in one plane, attitudes, heights, or a known start",
     # Surveys.
-    "arrangement not as it is said to be": "move the boards onto the line or plane, or survey without `known`",
+    "arrangement not as stated": "move the boards onto the line or plane, or survey without `known`",
     "board moved within an arrangement": "record that arrangement again, or end it before",
     "exchanged labels": "check the labels of these boards",
     "few ranges of a pair": "record for longer",
@@ -116,7 +116,7 @@ REMEDIES: Final = {
     "delays that a survey leaves open": "record another arrangement, or measure a distance: `calib plan survey` "
     "proposes which",
     "two solutions of a survey": "measure a distance that differs between the two solutions, and give it as known",
-    # What is doubtful about the data as a whole.
+    # Limits of the data as a whole.
     "few independent stretches": "record for longer",
     "short recording": "record for longer",
     "ranges without stamps": "record the stamps, if the device states them",
@@ -131,7 +131,7 @@ REMEDIES: Final = {
 """What to do about each fault and limit of a fit or a survey."""
 
 
-def either(findings: Sequence[Finding]) -> Finding:
+def combined(findings: Sequence[Finding]) -> Finding:
     """Return one finding for causes that have the same effect, with the names of all."""
     return Finding(
         " or ".join(one.fault for one in findings),

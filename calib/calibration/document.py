@@ -196,6 +196,15 @@ CALIBRATION_KEYS: Final = (
 )
 
 
+OLD_KEYS: Final = {"rests_on": "geometry", "left_open": "undetermined_text"}
+"""Present names of keys of the provenance, by the names in calibrations of version 0.2."""
+
+
+def with_current_keys(provenance: dict[str, Any]) -> dict[str, Any]:
+    """Return a provenance with the present names of its keys."""
+    return {OLD_KEYS.get(key, key): value for key, value in provenance.items()}
+
+
 def number(least: float, most: float, what: str, kind: Callable[[float], Any] = float) -> PlainValidator:
     """Return the check of a number between two bounds; `what` describes it in errors. The `kind` int allows whole
     numbers only.

@@ -24,7 +24,7 @@ from calib.estimator.range_rows import Mixture
 from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, search, widening
 from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
-from calib.findings import FIT_LEVELS, NAMED_DETOUR_M, SMALLEST_NS, Finding, either, warning
+from calib.findings import FIT_LEVELS, NAMED_DETOUR_M, SMALLEST_NS, Finding, combined, warning
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -262,7 +262,7 @@ def _covariance_and_findings(
             matter.setdefault((one.kind, one.names), one)
     named = [*places, *map(finding_of, matter.values())]
     noisy = any(one.kind == "readings" for one in findings)
-    return covariance, [_or_noise(one) if noisy and _like_noise(one) else one for one in named]
+    return covariance, [_with_noisy_powers(one) if noisy and _may_be_noisy_powers(one) else one for one in named]
 
 
 def _largest_shift(finding: FoundOffset, covariance: Floats) -> float:
@@ -338,19 +338,19 @@ def finding_of(offset: FoundOffset) -> Finding:
         "others": others,
     }
     names = [name for name in offset.names if name in OFFSET_FAULTS] if offset.kind == "shared" else [offset.kind]
-    return either(
+    return combined(
         [warning(OFFSET_FAULTS[name][0], OFFSET_FAULTS[name][1].format(**words), offset.p_value) for name in names]
     )
 
 
-def _like_noise(found: Finding) -> bool:
+def _may_be_noisy_powers(found: Finding) -> bool:
     """Return whether noise of power readings may have the same effect: on errors of places and of true distances."""
     return found.fault == "errors of places" or "true distances" in found.fault
 
 
-def _or_noise(found: Finding) -> Finding:
+def _with_noisy_powers(found: Finding) -> Finding:
     noise = warning("noisy powers", "the powers are noisy, which has the same effect", found.p_value)
-    return either([found, noise])
+    return combined([found, noise])
 
 
 def _reflections(found: KnownDistances) -> Iterator[Finding]:

@@ -46,8 +46,8 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
             f"corrections by the device itself, are unknown and contained in the {'constants' if pairs else 'delays'}; "
             f"damaged ranges cannot be distinguished from reflected ones",
         )
-    if ranges.left_skew is not None:
-        yield warning("clock skew", str(ranges.left_skew))
+    if ranges.uncorrected_skew is not None:
+        yield warning("clock skew", str(ranges.uncorrected_skew))
     elif unread:
         yield warning(
             "clock skew",
@@ -224,7 +224,7 @@ def implausible_values(delays_ns: Mapping[int, float], residuals_m: Floats) -> I
         yield warning("large errors", f"errors spread by {spread:.2f} m after the fit, more than those of UWB ranges")
 
 
-def doubts_about_data(ranges: Ranges, inliers: float, seconds: float) -> Iterator[Finding]:
+def limits_of_data(ranges: Ranges, inliers: float, seconds: float) -> Iterator[Finding]:
     """Yield findings about the data of a fit, the most serious first.
 
     `inliers` is the share of ranges within three sigmas, `seconds` the time that ranges cover.
@@ -254,7 +254,7 @@ SAME_LEVEL_DB: Final = 0.5
 """Smaller differences of levels of tags are ignored; medians of a pair's ranges are known to a tenth of this."""
 
 
-def unlike_power_levels(ranges: Ranges, calibration: Calibration) -> Iterator[Finding]:
+def differing_power_levels(ranges: Ranges, calibration: Calibration) -> Iterator[Finding]:
     """Yield a finding about tags whose powers differ from the others so much that their delays may contain an error.
 
     A frame and its answer take the same path, so a difference of their powers is due to the tags: transmit power and

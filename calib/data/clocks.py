@@ -74,16 +74,16 @@ def clocks_apart(exchanges: Exchanges) -> ClocksApart | None:
 
 
 @dataclass(frozen=True, slots=True)
-class LeftSkew:
+class UncorrectedSkew:
     """Errors of single-sided ranges by clock skew, in metres.
 
-    `bound_m` is the error for crystals at the ends of their tolerance, with the median reply time `reply_s`. `told_m`
+    `bound_m` is the error for crystals at the ends of their tolerance, with the median reply time `reply_s`. `read_m`
     is the 95 % quantile of the errors that follow from readings of the carrier integrators, NaN without readings.
     """
 
     bound_m: float
     reply_s: float
-    told_m: float
+    read_m: float
 
     def __str__(self) -> str:
         """Return the bound as a sentence."""
@@ -91,14 +91,14 @@ class LeftSkew:
             f"two clocks with errors of 20 ppm each cause up to {as_length(self.bound_m)} "
             f"(c/2 x 40 ppm x {1e6 * self.reply_s:.0f} µs of reply)"
         )
-        if not np.isfinite(self.told_m):
+        if not np.isfinite(self.read_m):
             return (
                 f"single-sided ranges without carrier readings: {bound}, which has the effect of an antenna delay "
                 f"with opposite signs for the two initiators"
             )
         return (
             f"single-sided ranges with clock skew in them: {bound}, and by the carriers' readings up to "
-            f"{as_length(self.told_m)}; imported with protocol ss-cfo they are corrected with the readings"
+            f"{as_length(self.read_m)}; imported with protocol ss-cfo they are corrected with the readings"
         )
 
 
@@ -109,7 +109,7 @@ def as_length(metres: float) -> str:
     return f"{100 * metres:.0f} cm" if metres >= 0.01 else f"{1e3 * metres:.1f} mm"
 
 
-def left_skew(exchanges: Exchanges) -> LeftSkew | None:
+def uncorrected_skew(exchanges: Exchanges) -> UncorrectedSkew | None:
     """Return the errors by skew of single-sided ranges with stamps and without skew correction; None without any.
 
     A single-sided time of flight is (round trip - reply) / 2. If the clocks differ by the relative rate s, its error is
@@ -121,10 +121,10 @@ def left_skew(exchanges: Exchanges) -> LeftSkew | None:
         return None
     reply_s = intervals(some).dt32 * TICK_S
     median_s, known = float(np.median(reply_s)), np.isfinite(some.skew2_ppm) & (some.skew2_ppm != 0)
-    told_m = (np.abs(some.skew2_ppm) * PPM_TO_METRES * reply_s)[known]
+    read_m = (np.abs(some.skew2_ppm) * PPM_TO_METRES * reply_s)[known]
     # Each of two crystals may be off its frequency by 20 ppm (IEEE 802.15.4, 15.4.9).
     bound_m = 2 * 20.0 * PPM_TO_METRES * median_s
-    return LeftSkew(bound_m, median_s, float(np.quantile(told_m, 0.95)) if len(told_m) else np.nan)
+    return UncorrectedSkew(bound_m, median_s, float(np.quantile(read_m, 0.95)) if len(read_m) else np.nan)
 
 
 def corrected(protocol: str) -> bool:

@@ -22,13 +22,13 @@ from calib.calibration.model import Calibration, CalibrationSource, given_calibr
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import (
     dependence_on_initiator,
-    doubts_about_data,
+    differing_power_levels,
     implausible_values,
     limits,
+    limits_of_data,
     refuse_contradicted,
     refuse_impossible,
     refuse_refuted,
-    unlike_power_levels,
 )
 from calib.data.ranges import Ranges, held_out
 from calib.data.sources import Data, load_ranges, require_arrivals
@@ -317,9 +317,9 @@ def result_of(
         *more,
         *findings,
         *implausible_values(calibration.delays_ns, residuals),
-        *unlike_power_levels(ranges, calibration),
+        *differing_power_levels(ranges, calibration),
         *_without_reference_power(found),
-        *doubts_about_data(ranges, float(np.mean(inliers)), found.blocks.seconds),
+        *limits_of_data(ranges, float(np.mean(inliers)), found.blocks.seconds),
     ]
     provenance: dict[str, Any] = {
         "writer": f"uwbcal {uwblink.__version__}",

@@ -167,7 +167,7 @@ def _calibration(
         "exchanges": int(network.means.count.sum()),
         "pairs": len(network.means.range_m),
         "recipe": "survey",
-        "rests_on": {
+        "geometry": {
             "arrangements": [
                 {"name": boards.name, "known": boards.shape, "tags": list(boards.tags)}
                 for boards in network.arrangements

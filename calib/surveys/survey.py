@@ -125,7 +125,7 @@ def _exchanged(found: Solution) -> Iterator[tuple[str, Solution]]:
 
 HYPOTHESES = {
     "wrong known distance": _distances,
-    "arrangement not as it is said to be": _shapes,
+    "arrangement not as stated": _shapes,
     "exchanged labels": _exchanged,
 }
 """The hypotheses by fault."""

@@ -183,18 +183,18 @@ def _result(
     own, verdict = _judge_delays(found, top)
     # Splits that the pairs do not determine are fixed, so the covariance is zero along them.
     free = [int(tag) for tag in verdict.named("delay") if tag]
-    left_open = _undetermined_text(free, [model.tags[k] for k in own], covariance[np.ix_(own, own)], model.free)
+    undetermined = _undetermined_text(free, [model.tags[k] for k in own], covariance[np.ix_(own, own)], model.free)
     if free and len(free) == len(own) and not flight.minimum_norm:
         raise UnanswerableError(
-            f"{scene.source}: {left_open}; use known positions for some seconds (`poses_until_s`), give positions of "
-            f"anchors, or a known delay (`fixed_ns`); `minimum_norm` fits nevertheless, with a warning",
+            f"{scene.source}: {undetermined}; use known positions for some seconds (`poses_until_s`), give positions "
+            f"of anchors, or a known delay (`fixed_ns`); `minimum_norm` fits nevertheless, with a warning",
             undetermined=[free],
         )
     calibration = calibration_of(found, covariance)
     if known is not None:
         calibration = _with_curve(calibration, known)
     provenance = _provenance(found, top, flight) | {"distance_std_m": _distance_std_m(top)}
-    provenance |= {"undetermined": [free], "left_open": left_open} if free else {}
+    provenance |= {"undetermined": [free], "undetermined_text": undetermined} if free else {}
     calibration = replace(
         calibration,
         delays_std_ns=calibration.delays_std_ns | dict.fromkeys(free, math.inf),
@@ -202,7 +202,7 @@ def _result(
     )
     unsettled = f"the fit stopped after {top.steps} steps before it converged: delays are not final"
     limits = [
-        ("undetermined delays", left_open),
+        ("undetermined delays", undetermined),
         ("not converged", "" if top.optimum.success else unsettled),
         ("second solution", rival),
         *(("unused known distance", text) for text in scene.tapes.left_out),
@@ -234,7 +234,7 @@ def _provenance(found: KnownDistances, top: Search, flight: FlightSettings) -> d
         "recipe": "trajectories",
         "truth": "ranges",
         "fitted": fitted_quantities(found),
-        "rests_on": {
+        "geometry": {
             "known_s": float(np.ptp(places_s)) if len(places_s) else 0.0,
             "moving": list(scene.moving),
             "anchors_given": [body for body, place in scene.still.items() if place is not None],

@@ -229,11 +229,11 @@ def test_numbers_that_are_no_differences_are_left_out_and_counted(folder):
 @pytest.mark.slow
 def test_the_wrong_sign_has_a_warning_without_poses(folder):
     rows = flown(4, 4.0)
-    doubted = imported(folder / "blind", rows, swapped=True, mocap=False)
-    believed = imported(folder / "right", rows, mocap=False)
+    swapped = imported(folder / "blind", rows, swapped=True, mocap=False)
+    correct = imported(folder / "right", rows, mocap=False)
     words = ("-c", folder / "fit.json", "--use", "receptions", "--model", "constant-velocity")
-    assert "wrong unit or sign" in processes.succeed("calib", "localize", doubted, *words).stdout
-    assert "wrong unit or sign" not in processes.succeed("calib", "localize", believed, *words).stdout
+    assert "wrong unit or sign" in processes.succeed("calib", "localize", swapped, *words).stdout
+    assert "wrong unit or sign" not in processes.succeed("calib", "localize", correct, *words).stdout
 
 
 @pytest.mark.parametrize(

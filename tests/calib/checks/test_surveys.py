@@ -53,7 +53,7 @@ TAPES = KnownDistance(1, 3, 2.1 + 0.3, 0.005, "A"), KnownDistance(2, 4, 2.7, 0.0
     ("world", "tapes", "evidence"),
     [
         (world_of, (), {}),
-        (crooked, (), {"arrangement not as it is said to be": "C: the boards are not on a line"}),
+        (crooked, (), {"arrangement not as stated": "C: the boards are not on a line"}),
         (moved, (), {"board moved within an arrangement": "C: board 4 was moved 2"}),
         (world_of, TAPES, {"wrong known distance": "the known distance of 1 and 3 in A differs from the ranges by +"}),
     ],

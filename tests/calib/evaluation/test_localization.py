@@ -254,13 +254,13 @@ def test_mean_and_variance_of_the_noise_are_those_of_draws(draws, value):
     # Four standard errors, and the effect of the bin width.
     assert update.noise_m[0] == pytest.approx(noise[near].mean(), abs=4 * spread / np.sqrt(count) + 0.004)
     assert update.variance_m2[0] == pytest.approx(noise[near].var(), rel=6 / np.sqrt(count) + 0.05, abs=1e-4)
-    assert update.believed[0] == (np.mean(wild[near]) < 0.5)
+    assert update.accepted[0] == (np.mean(wild[near]) < 0.5)
     assert np.exp(update.log_density[0]) == pytest.approx(count / COUNT / 0.02, rel=4 / np.sqrt(count) + 0.03)
 
 
 def test_extreme_innovations_are_finite_and_rejected():
     update = mixture_update(np.array([-50.0, 1e3, 1e5]), np.full(3, STD**2), ERRORS)
-    assert not update.believed.any()
+    assert not update.accepted.any()
     assert np.isfinite(update.noise_m).all()
     np.testing.assert_allclose(update.noise_m, 0, atol=1e-6)
     np.testing.assert_allclose(update.variance_m2, STD**2, rtol=1e-6)
@@ -268,7 +268,7 @@ def test_extreme_innovations_are_finite_and_rejected():
 
 def test_a_gate_accepts_or_rejects():
     update = gated_update(np.array([0.2, 0.4]), np.full(2, 0.01), 9.0)
-    assert (update.believed.tolist(), update.noise_m.tolist()) == ([True, False], [0.2, 0.0])
+    assert (update.accepted.tolist(), update.noise_m.tolist()) == ([True, False], [0.2, 0.0])
     assert update.variance_m2.tolist() == [0.0, 0.01]
 
 

@@ -74,7 +74,7 @@ def test_residuals_are_those_of_the_likelihood(known):
     np.testing.assert_allclose(residual**2 / 2, best - many.weigh(around).log_density, atol=1e-6)
     assert np.all(np.diff(residual) > 0)
     # Outliers have no information: their slope is not compared where they are likely.
-    inside = many.weigh(around).believed
+    inside = many.weigh(around).accepted
     further = (many.whiten(around + 1e-6)[0] - many.whiten(around - 1e-6)[0]) / 2e-6
     np.testing.assert_allclose(slope[inside], further[inside], rtol=0.02, atol=1e-3)
     with pytest.raises(BadInputError, match="range 1 has no power"):

@@ -279,8 +279,8 @@ def test_readings_that_are_of_no_range_are_named(tag, later_s):
         calib.load_ranges(replace(flight, temperature=readings))
 
 
-@pytest.mark.parametrize(("celsius", "doubted"), [(46.0, False), (72.0, True)])
-def test_degrees_fahrenheit_have_a_warning(celsius, doubted):
+@pytest.mark.parametrize(("celsius", "warned"), [(46.0, False), (72.0, True)])
+def test_degrees_fahrenheit_have_a_warning(celsius, warned):
     flight = calib.sample_flight()
     count = len(flight.exchanges)
     readings = {"time_ns": flight.exchanges.time_ns, "tag": np.full(count, 1), "supply_v": np.full(count, np.nan)}
@@ -288,7 +288,7 @@ def test_degrees_fahrenheit_have_a_warning(celsius, doubted):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         calib.load_ranges(replace(flight, temperature=readings))
-    assert ["Fahrenheit" in str(one.message) for one in caught] == [True] * doubted
+    assert ["Fahrenheit" in str(one.message) for one in caught] == [True] * warned
 
 
 def test_exact_ranges_of_a_data_frame_with_hot_boards_fit_and_warn_at_the_line_of_the_caller():
