@@ -27,9 +27,13 @@ OF_A_FIT: Final = BUDGET / 2
 """Share of sound fits with at least one false finding, over all tests. The other half of the budget belongs to the
 checks of the recording."""
 
-FIT_LEVELS: Final = {"offsets": 0.4 * OF_A_FIT, "reflections": 0.1 * OF_A_FIT, "places": 0.5 * OF_A_FIT}
-"""Parts of `OF_A_FIT`, a judgement: errors of places have three statistics, and shares of reflections that matter have
-p-values far below any level."""
+FIT_LEVELS: Final = {
+    "offsets": 0.5 * OF_A_FIT,
+    "places": 0.3 * OF_A_FIT,
+    **dict.fromkeys(("reflections", "directions", "powers", "clocks", "distances"), 0.04 * OF_A_FIT),
+}
+"""Parts of `OF_A_FIT`, a judgement: offsets and errors of places that matter may have p-values near the level, and the
+others have p-values far below any level."""
 
 SMALLEST_NS: Final = 0.02
 """Smallest error of a delay that is a finding: 3 mm of a range."""

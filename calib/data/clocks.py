@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.findings import FIT_LEVELS, exceeds
 from calib.pairs import pairs_of
 from calib.spread import STD_OF_MEDIAN, medians, spreads
 from uwblink.protocols.table import PROTOCOLS, Intervals, is_single_sided
@@ -22,13 +23,15 @@ PPM_TO_METRES: Final = 0.5 * SPEED_OF_LIGHT * 1e-6
 class ClocksApart:
     """A pair, the smaller id first, with different relative clock skews by stamps and by carriers, in ppm.
 
-    `moves_m` is the error of its ranges if the stamps are wrong.
+    `moves_m` is the error of its ranges if the stamps are wrong, `p_value` the probability of such a difference between
+    sound readings.
     """
 
     pair: tuple[int, int]
     stamps_ppm: float
     carrier_ppm: float
     moves_m: float
+    p_value: float
 
     def __str__(self) -> str:
         """Return a sentence about the fault."""
@@ -45,8 +48,8 @@ def clocks_apart(exchanges: Exchanges) -> ClocksApart | None:
 
     The comparison uses exchanges with three messages and readings of the carrier integrator; a reading of 0 means that
     it was not read. The sign of the readings is not known, because ranges with three messages do not depend on it: the
-    sign with the better agreement over all pairs is used. Pairs agree if the median difference is below 1 ppm, below a
-    tenth of the skew, or below eight standard errors, and pairs with fewer than 20 exchanges are ignored (judgements).
+    sign with the better agreement over all pairs is used. Median differences up to 1 ppm or a tenth of the skew are
+    tolerated, and pairs with fewer than 20 exchanges are ignored (judgements).
     """
     readings = np.abs(exchanges.skew1_ppm) + np.abs(exchanges.skew2_ppm)
     triple = [name for name in names_in(exchanges.protocol) if PROTOCOLS[name].third_sender is not None]
@@ -63,14 +66,20 @@ def clocks_apart(exchanges: Exchanges) -> ClocksApart | None:
     sign = 1.0 if np.sum((by_stamps * by_carrier)[enough]) >= 0 else -1.0
     differ, by_carrier = medians(stamps - sign * carrier, pair), sign * by_carrier
     std = STD_OF_MEDIAN * spreads(stamps - sign * carrier, pair) / np.sqrt(count)
-    apart = np.abs(differ) >= np.maximum.reduce([np.ones(len(count)), 8.0 * std, 0.1 * np.abs(by_carrier)])
+    tolerance = np.maximum(1.0, 0.1 * np.abs(by_carrier))
+    p_values = np.array(
+        [
+            exceeds(float(value), float(error), several - 1, tolerance=float(least), tried=int(enough.sum()))
+            for value, error, several, least in zip(differ, std, count.tolist(), tolerance, strict=True)
+        ]
+    )
     moves_m = PPM_TO_METRES * np.abs(differ) * medians(intervals(some).dt32 * TICK_S, pair)
-    moves_m = np.where(apart & enough, moves_m, 0.0)
+    moves_m = np.where((p_values < FIT_LEVELS["clocks"]) & enough, moves_m, 0.0)
     if not moves_m.any():
         return None
     k = int(np.argmax(moves_m))
     low, high = sorted((int(some.initiator[first[k]]), int(some.target[first[k]])))
-    return ClocksApart((low, high), float(by_stamps[k]), float(by_carrier[k]), float(moves_m[k]))
+    return ClocksApart((low, high), *(float(one[k]) for one in (by_stamps, by_carrier, moves_m, p_values)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
-from scipy import sparse, special
+from scipy import sparse
 from threadpoolctl import threadpool_limits
 
 from calib.calibration.document import Split, reading_provenance
@@ -26,7 +26,7 @@ from calib.estimator.rows import sum_rows
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
 from calib.estimator.unknowns import Layout
-from calib.findings import Finding, warning
+from calib.findings import FIT_LEVELS, Finding, exceeds, warning
 from calib.fitting.fitting import fitted_quantities, result_of
 from calib.fitting.result import FitResult
 from calib.information import LOOSEST, InformationColumn, Verdict, judge
@@ -350,7 +350,7 @@ def _of_motion(top: Search) -> Iterator[Finding]:
 def _of_tapes(top: Search) -> Iterator[Finding]:
     """Yield a finding for each tape that the ranges contradict, by deleted residuals (Cook and Weisberg 1982).
 
-    These are beyond four standard errors and three centimetres.
+    Smaller ones than three centimetres are no finding.
     """
     rows, x = top.known.get("tape"), top.optimum.x
     if not isinstance(rows, TapeRows):
@@ -365,12 +365,13 @@ def _of_tapes(top: Search) -> Iterator[Finding]:
             continue
         free = 1 - leverage
         without = float(left[mine].mean()) / free
-        deviation = abs(without) * math.sqrt(free) / one.sigma_m
-        if deviation >= 4.0 and abs(without) >= 0.03:
+        std = one.sigma_m / math.sqrt(free)
+        p_value = exceeds(without, std, np.inf, tried=len(tapes.stated))
+        if p_value < FIT_LEVELS["distances"] and abs(without) >= 0.03:
             yield warning(
                 "wrong known distance",
                 f"the distance of tags {one.first} and {one.second}, {one.distance_m:.3f} m, is "
                 f"{100 * abs(without):.0f} cm {'more' if without > 0 else 'less'} than by all other data "
-                f"({deviation:.0f} standard errors)",
-                min(1.0, len(tapes.stated) * 2 * float(special.ndtr(-deviation))),
+                f"({abs(without) / std:.0f} standard errors)",
+                p_value,
             )
