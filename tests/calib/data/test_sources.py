@@ -112,6 +112,15 @@ def test_localizing_and_examining_refuse_ranges():
         assert raised.value.parameter == "data"
 
 
+def test_ranges_that_are_given_twice_are_refused_and_halves_are_not():
+    whole = calib.load_ranges(calib.sample_flight(600))
+    halves = [whole[:300], whole[300:]]
+    assert len(calib.load_ranges(halves)) == len(whole)
+    for twice in ([whole, whole], [*halves, whole[:300]]):
+        with pytest.raises(calib.BadInputError, match="same exchanges"):
+            calib.fit(twice)
+
+
 def test_arrays_become_ranges():
     r = calib.Ranges.from_arrays([3, 4], initiator=1, target=[2, 3], fpp1_dbm=[-85.0, 0.0], truth_m=[2.9, 3.9])
     assert (r.tags(), repr(r)) == ([1, 2, 3], "<Ranges of memory: 2 of tags 1, 2, 3>")
