@@ -107,7 +107,8 @@ def test_a_range_is_corrected_by_two_temperatures_and_says_what_is_missing_witho
     blind, plain = (one.correct(*columns, weights=weights) for one in (known, replace(known, temperatures=())))
     assert blind.range_m == pytest.approx(plain.range_m, abs=1e-12)
     # Both ends have any temperature of the fitted span.
-    ends = np.linspace(*slope.span_c, 2001) - slope.reference_c
+    low, high = slope.span_c
+    ends = low + (high - low) * (np.arange(2000) + 0.5) / 2000 - slope.reference_c
     missing = np.hypot(slope.m_per_k, slope.std_m_per_k) * np.sqrt(2 * np.mean(ends**2))
     assert blind.sigma_total_m == pytest.approx(np.hypot(plain.sigma_total_m, missing), rel=1e-4)
     one, other = (known.correct(3.0, -85.0, -86.0, 1, 2, temperature_c=(25.0, c)).range_m for c in (25.0, 26.0))
