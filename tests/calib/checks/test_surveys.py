@@ -65,6 +65,7 @@ def test_contradictions_of_a_survey_are_named(tmp_path, world, tapes, evidence):
     assert all(found[fault].evidence.startswith(text) for fault, text in evidence.items())
 
 
+@pytest.mark.slow
 def test_powers_that_hardly_vary_are_named(tmp_path):
     assert list(faults(save(world_of(places=FOUR[:3]), tmp_path / "a.uwb", power_dbm=-80.0))) == [
         "powers that hardly vary"

@@ -57,6 +57,7 @@ def test_a_file_an_open_recording_and_an_object_are_the_same(path):
     assert_same(both[:900], from_file)
 
 
+@pytest.mark.slow
 def test_every_function_accepts_the_sources_of_a_fit(tmp_path):
     in_memory = sample_flight(300)
     path = written(tmp_path / "sample.uwb", in_memory, in_memory.meta["planted"])

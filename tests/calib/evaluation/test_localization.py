@@ -54,6 +54,7 @@ def clean(flight: Flight, sigma_m=0.08) -> tuple[Flight, Calibration]:
     return replace(flight, ranges=replace(ranges, raw_m=raw)), known
 
 
+@pytest.mark.slow
 def test_the_filter_is_consistent_on_clean_ranges(flights):
     # Without a gate, which rejects the largest hundredth of NIS.
     found = summarize(localize(*clean(flights["test1"]), Settings(gate=1e9, seeds=1)))
@@ -113,6 +114,7 @@ def test_a_calibration_reduces_the_error_by_a_third(flights, fitted):
     assert all(spread < 0.02 for spread in summary.spread_m.values())
 
 
+@pytest.mark.slow
 def test_fixed_variances_are_those_of_the_training_flight(flights, fitted):
     """With noise of 8 cm, values of the grid near it have the smallest error."""
     flight, exact = clean(beginning(flights["test1"], 8))

@@ -37,6 +37,7 @@ def wrong_m(delays_ns, drift_m):
     return np.array([LIGHT / 2 * (off[1] + off[tag]) for tag in range(11, 17)])
 
 
+@pytest.mark.slow
 def test_the_command_compares_states_with_fixed_delays_and_prints_their_end(known, tmp_path):
     known.save(tmp_path / "known.json")
     drift_m = {1: 0.06, 2: 0.06}

@@ -26,6 +26,7 @@ def named(result):
     return [warning for warning in result.warnings if warning.startswith("errors depend on places")]
 
 
+@pytest.mark.slow
 def test_offsets_between_bodies_that_last_are_in_the_intervals_and_named():
     # If the bodies were unknown, pairs would count as independent, and intervals would hold in half of the cases.
     blind, seeing = [], []

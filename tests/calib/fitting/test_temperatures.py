@@ -69,6 +69,7 @@ def test_sound_flights_have_no_slope_and_state_its_uncertainty(recipe, seed):
     assert "mm/K is not significant" in repr(found)
 
 
+@pytest.mark.slow
 def test_a_warmer_flight_is_corrected_by_its_readings(tmp_path):
     first = written(tmp_path / "a.uwb", WARM, 3)
     second = written(tmp_path / "b.uwb", replace(WARM, start_c=45.0, warmer_k=5.0), 3, 1)

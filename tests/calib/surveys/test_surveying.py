@@ -75,6 +75,7 @@ def test_planted_delays_lie_within_their_intervals(shape, boards, count):
     assert_sound(world, calib.survey(world.ranges, known="" if shape == "space" else shape))
 
 
+@pytest.mark.slow
 def test_intervals_of_delays_and_places_hold_in_the_stated_frame():
     world = standing_boards(40, "plane", boards=5, arrangements=5)
     result = calib.survey(world.ranges, known="plane")
@@ -117,6 +118,7 @@ def test_one_arrangement_in_space_determines_nothing_and_names_the_boards():
     assert caught.value.undetermined == [[1, 2, 3, 4, 5]]
 
 
+@pytest.mark.slow
 def test_a_curve_over_power_is_found_along_with_the_delays():
     world = standing_boards(2, "plane", boards=5, arrangements=6, bias_size_m=0.06, size_m=9.0, pair_error_m=0.01)
     result = calib.survey(world.ranges, known="plane")

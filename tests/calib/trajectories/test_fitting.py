@@ -68,6 +68,7 @@ def test_calibrations_without_distances_correct_other_flights(known):
     assert abs(np.median(applied.raw_m - other.distance_m)) > 0.012
 
 
+@pytest.mark.slow
 def test_a_curve_is_taken_from_another_calibration_with_its_uncertainty(known):
     flown = flight(seconds=8.0, seed=3)
     given: dict[str, Any] = {"poses_until_s": 5.0, "heading_std_deg": 0.0}
