@@ -416,5 +416,7 @@ def test_a_clock_that_is_fast_by_stamps_only_is_named_with_its_effect():
     assert abs(found.stamps_ppm - found.carrier_ppm) == pytest.approx(5.0, abs=0.2)
     reply_s = float(np.median((some.tx2 - some.rx1) % 2**32)) * TICK_S
     assert found.moves_m == pytest.approx(0.5 * SPEED_OF_LIGHT * 5e-6 * reply_s, rel=0.05)
+    assert found.p_value < 1e-6
     findings = calib.fit(replace(calib.sample_flight(900), exchanges=some)).findings
-    assert ("clocks contradict the carriers", str(found)) in [(one.fault, one.evidence) for one in findings]
+    stated = "clocks contradict the carriers", str(found), found.p_value
+    assert stated in [(one.fault, one.evidence, one.p_value) for one in findings]

@@ -65,8 +65,9 @@ def test_a_wrong_measured_distance_is_named():
     # A distance without an arrangement does not state when the bodies stood still.
     tapes = [by_tape(flown, 1, 3, 0.3), by_tape(flown, 2, 5), KnownDistance(2, 3, 2.0, 0.02)]
     result = calib.fit_from_ranges(flown, distances=tapes, **KNOWN_START)
-    (named,) = [warning for warning in result.warnings if "measure it again" in warning]
-    told = re.match(r"the distance of tags 1 and 3, 3\.952 m, is ([\d.]+) .* more than ", named)
+    (named,) = [one for one in result.findings if one.fault == "wrong known distance"]
+    told = re.match(r"the distance of tags 1 and 3, 3\.952 m, is ([\d.]+) .* more than ", named.evidence)
+    assert named.p_value < 1e-4
     # Thirty centimetres, within the accuracy of 16 ranges of the pair and known positions of 2 cm.
     assert 25 < float(told[1]) < 35
     assert [text for text in result.warnings if "tags 2 and 3 is not used" in text]
