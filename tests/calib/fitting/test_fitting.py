@@ -65,6 +65,7 @@ def test_the_sign_of_a_pairs_error_is_stated(by_m, way):
     found = calib.fit(replace(some, initiator=first, target=second, raw_m=some.raw_m + off))
     (named,) = [one for one in found.findings if one.evidence.startswith("pair 2-7") and "initiates" in one.evidence]
     assert f"{way} if tag 2 initiates" in named.evidence
+    assert named.p_value is not None
     assert 0 < named.p_value < 1e-6
 
 

@@ -157,6 +157,7 @@ def test_errors_of_readings_that_last_are_no_difference_of_tags():
         assert "power levels of tags" not in [one.fault for one in calib.fit(sound).findings]
         (named,) = [one for one in calib.fit(faulty).findings if one.fault == "power levels of tags"]
         assert named.evidence.startswith("powers of tag 3 (+")
+        assert named.p_value is not None
         assert named.p_value < 1e-4
 
 

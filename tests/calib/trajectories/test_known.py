@@ -67,6 +67,7 @@ def test_a_wrong_measured_distance_is_named():
     result = calib.fit_from_ranges(flown, distances=tapes, **KNOWN_START)
     (named,) = [one for one in result.findings if one.fault == "wrong known distance"]
     told = re.match(r"the distance of tags 1 and 3, 3\.952 m, is ([\d.]+) .* more than ", named.evidence)
+    assert named.p_value is not None
     assert named.p_value < 1e-4
     # Thirty centimetres, within the accuracy of 16 ranges of the pair and known positions of 2 cm.
     assert 25 < float(told[1]) < 35
