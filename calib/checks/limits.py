@@ -17,7 +17,7 @@ from calib.checks.residuals import ONE_WAY_M
 from calib.data.clocks import as_length, corrected
 from calib.data.ranges import NO_STAMPS, STATIC, Ranges, growth_fault, look_like
 from calib.errors import UnanswerableError
-from calib.estimator.known_distances import KnownDistances
+from calib.estimator.known_distances import RangeFit
 from calib.findings import FIT_LEVELS, SMALLEST_NS, STRETCHES, Finding, exceeds, warning
 from calib.spread import TWO_SIDED_95, medians, robust_spread
 from uwblink.arrays import Floats
@@ -35,7 +35,7 @@ REGISTER_NS: Final = 65_536 * TICK_S * 1e9
 A larger delay is a length in the wrong unit: 154 m of range per tag."""
 
 
-def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Mapping[int, float]) -> Iterator[Finding]:
+def limits(found: RangeFit, ranges: Ranges, residuals_m: Floats, fixed: Mapping[int, float]) -> Iterator[Finding]:
     """Yield findings about undetermined values; `residuals_m` (n,) are fully corrected errors."""
     model, pairs, count = found.model, found.model.settings.constants == "pair", len(found.model.pairs.ends)
     bare = int(np.count_nonzero(ranges.protocol == NO_STAMPS))
@@ -75,7 +75,7 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
         )
 
 
-def _without_curve(found: KnownDistances, ranges: Ranges, residuals_m: Floats) -> Finding:
+def _without_curve(found: RangeFit, ranges: Ranges, residuals_m: Floats) -> Finding:
     if not found.model.settings.delays_only and found.model.powered.any():
         return warning(
             "constant power",

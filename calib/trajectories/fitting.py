@@ -19,7 +19,7 @@ from calib.checks.limits import refuse_refuted
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.inverse import Matrix, inverse_of
-from calib.estimator.known_distances import Fitted, KnownDistances, model_of, with_covariances
+from calib.estimator.known_distances import Fitted, RangeFit, model_of, with_covariances
 from calib.estimator.losses import MIXTURE
 from calib.estimator.range_model import BOARD_DELAY_STD_NS, METRES_A_NS, RangeModel
 from calib.estimator.rows import sum_rows
@@ -135,7 +135,7 @@ def range_model(scene: Scene, settings: FitSettings, *, curve: bool, offsets: bo
     return model, scene.only(model.ranges.truth_m.astype(np.int64))
 
 
-def _fit_to_estimated_distances(model: RangeModel, top: Search, known: Calibration | None) -> KnownDistances:
+def _fit_to_estimated_distances(model: RangeModel, top: Search, known: Calibration | None) -> RangeFit:
     """Return the result as a fit to the estimated distances; its covariance includes their uncertainty."""
     distances = top.geometry.distances(top.optimum.x)[0]
     model = replace(model, ranges=replace(model.ranges, truth_m=distances))
@@ -158,7 +158,7 @@ def _fit_to_estimated_distances(model: RangeModel, top: Search, known: Calibrati
     return found
 
 
-def _curve_uncertainty(found: KnownDistances, known: Calibration) -> Floats:
+def _curve_uncertainty(found: RangeFit, known: Calibration) -> Floats:
     """Return the covariance (tags, tags) in ns^2 that the uncertainty of a kept curve adds to the delays."""
     splines = basis(np.clip(found.model.lifted, *known.bias_curve.range), np.array(known.bias_curve.knots))
     # Derivatives of the unknowns by the coefficients: covariance times information.
@@ -168,7 +168,7 @@ def _curve_uncertainty(found: KnownDistances, known: Calibration) -> Floats:
 
 
 def _result(
-    found: KnownDistances,
+    found: RangeFit,
     top: Search,
     flight: FlightSettings,
     settings: FitSettings,
@@ -226,7 +226,7 @@ def _with_curve(calibration: Calibration, known: Calibration) -> Calibration:
     return replace(calibration, bias_curve=known.bias_curve, uncertainty=uncertainty)
 
 
-def _provenance(found: KnownDistances, top: Search, flight: FlightSettings) -> dict[str, Any]:
+def _provenance(found: RangeFit, top: Search, flight: FlightSettings) -> dict[str, Any]:
     """Return the provenance that only fits of trajectories have."""
     scene, places_s, reference_dbm = top.motion.scene, top.motion.scene.places.time_s, found.model.reference_dbm
     return {
@@ -259,7 +259,7 @@ def variance_factor(scene: Scene) -> float:
     return 1.0 if given >= 2 or measured else 9.0
 
 
-def _judge_delays(found: KnownDistances, top: Search) -> tuple[Ints, Verdict]:
+def _judge_delays(found: RangeFit, top: Search) -> tuple[Ints, Verdict]:
     """Return the numbers of the delays that are not pinned (k,), and the verdict on them."""
     layout, optimum = top.optimum.layout, top.optimum
     unpinned = np.intersect1d(layout.indices(["delay"]), layout.free())
