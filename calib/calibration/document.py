@@ -196,13 +196,10 @@ CALIBRATION_KEYS: Final = (
 )
 
 
-OLD_KEYS: Final = {"rests_on": "geometry", "left_open": "undetermined_text"}
-"""Present names of keys of the provenance, by the names in calibrations of version 0.2."""
-
-
 def with_current_keys(provenance: dict[str, Any]) -> dict[str, Any]:
-    """Return a provenance with the present names of its keys."""
-    return {OLD_KEYS.get(key, key): value for key, value in provenance.items()}
+    """Return a provenance with the present names of two keys that had other names in version 0.2."""
+    renamed = {"rests_on": "geometry", "left_open": "undetermined_text"}
+    return {renamed.get(key, key): value for key, value in provenance.items()}
 
 
 def number(least: float, most: float, what: str, kind: Callable[[float], Any] = float) -> PlainValidator:
