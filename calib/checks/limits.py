@@ -207,14 +207,11 @@ def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: 
     )
 
 
-LEAST_INLIERS: Final = 0.5
-"""Minimum share of ranges within three sigmas of a credible fit; for direct ranges it is 99.7 %. If more than half are
-reflected, delays depend on the minority; invented places leave 0 to 34 % (swarm broadcasts)."""
-
-
 def refuse_contradicted(inliers: float, ranges: Ranges, findings: Sequence[Finding]) -> None:
     """Raise `UnanswerableError`, with the findings, if most ranges contradict their own fit."""
-    if inliers < LEAST_INLIERS:
+    # Of direct ranges 99.7 % lie within. If more than half are reflected, delays depend on the minority; invented
+    # places leave 0 to 34 % (swarm broadcasts).
+    if inliers < 0.5:
         evidence = "; ".join(map(str, findings)) or "no single tag or pair explains it"
         raise UnanswerableError(
             f"{ranges.source}: {100 * (1 - inliers):.0f} % of the ranges lie outside three sigmas of this fit, which "
