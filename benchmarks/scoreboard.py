@@ -46,8 +46,6 @@ Public flights, calibrated and evaluated by the commands below (`make scoreboard
 | ranges | calibration | count | median (cm) | robust deviation (cm) | in 95 % (%) | localization (m) |
 |---|---|---|---|---|---|---|
 """
-DOUBTED: Final = "\n## What was refused or doubted\n\nFindings, warnings and errors: the first clause of each, once.\n"
-RECIPES: Final = "\n## Recipes\n\nA and B are flights; every command is also run with A and B exchanged.\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -450,7 +448,8 @@ def write(folder: Path, page: Path, work: Path) -> int:
     if not there:
         print(f"error: {folder}: none of {', '.join(data.archive for data in DATA_SETS)}", file=sys.stderr)
         return 2
-    rows, doubted, recipes = "", "", ""
+    rows, recipes = "", "\n## Recipes\n\nA and B are flights; every command is also run with A and B exchanged.\n"
+    messages = "\n## What was refused, and warnings\n\nFindings, warnings and errors: the first clause of each, once.\n"
     for data in DATA_SETS:
         recipes += (
             f"\n**{data.name}** {data.origin}\n\n<!-- not run: it needs the data -->\n```sh\n{data.commands}```\n"
@@ -462,8 +461,8 @@ def write(folder: Path, page: Path, work: Path) -> int:
         lines, notes = judge(data, folder, work)
         none = "refused" if "fit" in data.commands else "no true distances"
         rows += "".join(f"{line}\n" for line in [f"| **{data.name}** | {'' if lines else none} | | | | | |", *lines])
-        doubted += f"\n**{data.name}**\n\n" + "".join(f"{note}\n" for note in notes or ["- nothing"])
-    page.write_text(HEAD + rows + DOUBTED + doubted + RECIPES + recipes, encoding="utf-8")
+        messages += f"\n**{data.name}**\n\n" + "".join(f"{note}\n" for note in notes or ["- nothing"])
+    page.write_text(HEAD + rows + messages + recipes, encoding="utf-8")
     print(page)
     return 0 if len(there) == len(DATA_SETS) else 1
 

@@ -27,9 +27,13 @@ OF_A_FIT: Final = BUDGET / 2
 """Share of sound fits with at least one false finding, over all tests. The other half of the budget belongs to the
 checks of the recording."""
 
-FIT_LEVELS: Final = {"offsets": 0.6 * OF_A_FIT, "reflections": 0.1 * OF_A_FIT, "places": 0.3 * OF_A_FIT}
-"""Parts of `OF_A_FIT`, a judgement. Offsets have most, because small ones matter; errors of places have three statistics,
-and shares of reflections that matter have p-values far below any level."""
+FIT_LEVELS: Final = {
+    "offsets": 0.5 * OF_A_FIT,
+    "places": 0.3 * OF_A_FIT,
+    **dict.fromkeys(("reflections", "directions", "powers", "clocks", "distances"), 0.04 * OF_A_FIT),
+}
+"""Parts of `OF_A_FIT`, a judgement: offsets and errors of places that matter may have p-values near the level, and the
+others have p-values far below any level."""
 
 SMALLEST_NS: Final = 0.02
 """Smallest error of a delay that is a finding: 3 mm of a range."""
@@ -107,7 +111,7 @@ REMEDIES: Final = {
     "unused known distance": "give an arrangement or its seconds",
     "second solution": "use anchors that are not in one plane, attitudes, heights, or a known start",
     # Surveys.
-    "arrangement not as it is said to be": "move the boards onto the line or plane, or survey without `known`",
+    "arrangement not as stated": "move the boards onto the line or plane, or survey without `known`",
     "board moved within an arrangement": "record that arrangement again, or end it before",
     "exchanged labels": "check the labels of these boards",
     "few ranges of a pair": "record for longer",
@@ -116,7 +120,7 @@ REMEDIES: Final = {
     "delays that a survey leaves open": "record another arrangement, or measure a distance: `calib plan survey` "
     "proposes which",
     "two solutions of a survey": "measure a distance that differs between the two solutions, and give it as known",
-    # What is doubtful about the data as a whole.
+    # Limits of the data as a whole.
     "few independent stretches": "record for longer",
     "short recording": "record for longer",
     "ranges without stamps": "record the stamps, if the device states them",
@@ -131,7 +135,7 @@ REMEDIES: Final = {
 """What to do about each fault and limit of a fit or a survey."""
 
 
-def either(findings: Sequence[Finding]) -> Finding:
+def combined(findings: Sequence[Finding]) -> Finding:
     """Return one finding for causes that have the same effect, with the names of all."""
     return Finding(
         " or ".join(one.fault for one in findings),

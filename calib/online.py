@@ -81,7 +81,7 @@ def range_errors(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Rang
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeighedInnovation:
-    """Posterior mean and variance of the noise in an innovation, and whether the range is accepted (`believed`).
+    """Posterior mean and variance of the noise in an innovation, and whether the range is `accepted`.
 
     `log_density` is the logarithm of the density of the innovation (1/m). `nis` is the square of the innovation over
     its variance (normalised innovation squared). `tail` is the probability that the range is not direct. `reflected`
@@ -90,7 +90,7 @@ class WeighedInnovation:
 
     noise_m: Floats
     variance_m2: Floats
-    believed: Bools
+    accepted: Bools
     log_density: Floats
     nis: Floats
     tail: Floats
@@ -102,14 +102,14 @@ def gated_update(innovation_m: Floats, variance_m2: Floats, gate: float) -> Weig
 
     A rejected innovation has the density of one at the gate.
     """
-    believed = innovation_m**2 < gate * variance_m2
+    accepted = innovation_m**2 < gate * variance_m2
     return WeighedInnovation(
-        noise_m=np.where(believed, innovation_m, 0.0),
-        variance_m2=np.where(believed, 0.0, variance_m2),
-        believed=believed,
+        noise_m=np.where(accepted, innovation_m, 0.0),
+        variance_m2=np.where(accepted, 0.0, variance_m2),
+        accepted=accepted,
         log_density=-0.5 * (np.minimum(innovation_m**2 / variance_m2, gate) + np.log(2 * np.pi * variance_m2)),
         nis=innovation_m**2 / variance_m2,
-        tail=np.where(believed, 0.0, 1.0),
+        tail=np.where(accepted, 0.0, 1.0),
         reflected=np.zeros((*np.shape(innovation_m), 1)),
     )
 
@@ -144,7 +144,7 @@ def mixture_update(innovation_m: Floats, variance_m2: Floats, errors: RangeError
     return WeighedInnovation(
         noise_m=mean,
         variance_m2=np.maximum(square - mean**2, 0.0),
-        believed=wild < 0.5,
+        accepted=wild < 0.5,
         log_density=np.log(total),
         nis=innovation_m**2 / variance_m2,
         tail=1 - core / total,

@@ -367,6 +367,7 @@ def test_served_poses_do_not_replace_an_input(tmp_path):
         assert (tmp_path / "scenario").read_text() == BENCH.read_text()
 
 
+@pytest.mark.slow
 def test_the_command_printed_by_a_server_records_and_replay_repeats_it(tmp_path, ports):
     said = succeed("uwbsim", "serve", BENCH, "--link-dir", tmp_path / "ports", "--duration", 0.1)
     assert said.stdout.startswith("tag  10  ")
@@ -509,6 +510,7 @@ def test_delays_without_standard_errors_are_not_taken_for_exact(seeds, tmp_path)
         assert told in run(*line, cwd=tmp_path).stdout
 
 
+@pytest.mark.slow
 def test_commands_without_powers_work(tmp_path):
     path = changed(tmp_path / "f.uwb", anchors=True, **nothing("fpp1_dbm", "fpp2_dbm"))
     (finding,) = calib.examine(path)

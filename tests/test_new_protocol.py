@@ -69,6 +69,7 @@ def test_run_show_and_fit(row, tmp_path):
     assert found == pytest.approx(flown.meta["planted"]["delays_ns"], abs=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", [SYMMETRIC], indirect=True)
 def test_compare_optimum_and_predict_support_a_new_protocol(row, tmp_path, monkeypatch):
     monkeypatch.setattr("uwblink.pages.figures.drawn", pages.outline)

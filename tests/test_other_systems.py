@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from tests.shared_data import ROOT
 
 # Libraries are imported before: their own variants for other systems are not tested here.
@@ -31,6 +33,7 @@ for line in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow
 def test_all_but_virtual_boards_works_without_what_linux_has(tmp_path):
     lines = {
         "calib sample -o flight.uwb": 0,

@@ -54,6 +54,7 @@ WARNING = (
 )
 
 
+@pytest.mark.slow
 def test_protocol_and_loss_of_another_distribution_are_simulated_and_fitted_with(run, tmp_path):
     flight = tmp_path / "f.uwb"
     settings = ("--set", "ranging.protocol=strange-ds", "--set", "run.duration_s=30")

@@ -196,6 +196,12 @@ CALIBRATION_KEYS: Final = (
 )
 
 
+def with_current_keys(provenance: dict[str, Any]) -> dict[str, Any]:
+    """Return a provenance with the present names of two keys that had other names in version 0.2."""
+    renamed = {"rests_on": "geometry", "left_open": "undetermined_text"}
+    return {renamed.get(key, key): value for key, value in provenance.items()}
+
+
 def number(least: float, most: float, what: str, kind: Callable[[float], Any] = float) -> PlainValidator:
     """Return the check of a number between two bounds; `what` describes it in errors. The `kind` int allows whole
     numbers only.

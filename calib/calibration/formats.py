@@ -601,6 +601,8 @@ def read_miluv(path: Path) -> Calibration:
             "schema_version": 3,
             "delays_ns": table["delays_ns"],
             "delays_std_ns": {},
+            # Not in the file: the authors' program fits delays with SciPy's Cauchy loss and `f_scale` 0.1 ns, and means
+            # the lifted powers of both ends (above -82 dBm).
             "loss": "cauchy",
             "scale_ns": 0.1,
             "lift": "mean-of-lifted",

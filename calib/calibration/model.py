@@ -41,6 +41,7 @@ from calib.calibration.document import (
     pair_name,
     read,
     reading_provenance,
+    with_current_keys,
     write,
 )
 from calib.calibration.error_model import CheckedErrors
@@ -141,7 +142,7 @@ class Calibration:
     speed_of_light: Light
     bias_curve: BiasCurve
     sigma_curve: SigmaCurve
-    provenance: dict[str, Any] = field(default_factory=dict)
+    provenance: Annotated[dict[str, Any], AfterValidator(with_current_keys)] = field(default_factory=dict)
     power_at: Annotated[str, one_of(("exchange", "reception"))] = "exchange"
     groups: dict[str, TagGroup] = field(default_factory=dict)
     errors: CheckedErrors | None = None
@@ -607,7 +608,7 @@ def _headline(calibration: Calibration) -> str:
 
 def known_facts(provenance: Mapping[str, Any]) -> str:
     """Return a text on the facts that a fit used instead of known distances; "" if distances were known."""
-    known = provenance.get("rests_on")
+    known = provenance.get("geometry")
     if provenance.get("truth") != "ranges" or not isinstance(known, Mapping):
         return ""
     off, seconds = provenance.get("distance_std_m"), known.get("known_s")

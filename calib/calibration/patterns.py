@@ -105,11 +105,13 @@ class TemperatureSlope:
 
     @property
     def rms_m(self) -> float:
-        """A bound of the standard deviation of an end with unknown temperature, in metres.
+        """The root mean square effect of an end with unknown temperature, in metres.
 
-        It is the slope, including its standard error, times the whole span of the fitted temperatures.
+        All temperatures of the fitted span have the same probability; the slope includes its standard error.
         """
-        return math.hypot(self.m_per_k, self.std_m_per_k) * (self.span_c[1] - self.span_c[0])
+        low, high = (value - self.reference_c for value in self.span_c)
+        # The mean square of a uniform distribution from `low` to `high`.
+        return math.hypot(self.m_per_k, self.std_m_per_k) * math.sqrt((low**2 + low * high + high**2) / 3)
 
     def values(self, temperature_c: Floats | NDArray[np.float32]) -> Floats:
         """Return temperatures (n,) minus the reference, (n, 1)."""

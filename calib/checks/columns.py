@@ -11,7 +11,7 @@ import numpy as np
 from calib.calibration.document import known_of_splits
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.checks.recording_view import RecordingView
-from calib.data.clocks import left_skew
+from calib.data.clocks import uncorrected_skew
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
 from calib.estimator.identifiability import free_directions
@@ -420,8 +420,8 @@ def swapped_roles(view: RecordingView) -> Iterator[Candidate]:
 
 def unread(view: RecordingView) -> Iterator[Candidate]:
     """Find single-sided ranges without carrier readings, whose clock skew is unknown."""
-    left = left_skew(view.exchanges)
-    if left and not np.isfinite(left.told_m):
+    left = uncorrected_skew(view.exchanges)
+    if left and not np.isfinite(left.read_m):
         yield Candidate("single-sided without carrier readings", str(left))
 
 

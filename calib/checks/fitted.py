@@ -18,13 +18,13 @@ from calib.checks.places import place_covariance
 from calib.estimator.arrival_rows import OFFSET_OF_PATH, PATH_SIGNS
 from calib.estimator.covariance import of_few_draws
 from calib.estimator.inverse import positive_part
-from calib.estimator.known_distances import KnownDistances
+from calib.estimator.known_distances import RangeFit
 from calib.estimator.range_model import METRES_A_NS, TYPICAL_OFFSET_M, RangeModel, free_ends
 from calib.estimator.range_rows import Mixture
 from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, search, widening
 from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
-from calib.findings import FIT_LEVELS, NAMED_DETOUR_M, SMALLEST_NS, Finding, either, warning
+from calib.findings import FIT_LEVELS, NAMED_DETOUR_M, SMALLEST_NS, Finding, combined, warning
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -49,7 +49,7 @@ UNIT = np.ones((1, 1))
 """The derivative of a range by its own offset."""
 
 
-def examine_fit(found: KnownDistances) -> tuple[Floats, list[Finding]]:
+def examine_fit(found: RangeFit) -> tuple[Floats, list[Finding]]:
     """Test a fit against alternatives with one more unknown each.
 
     Returns the covariance (tags, tags) of the delays in ns^2, which includes the effect of misfits, and findings about
@@ -88,7 +88,7 @@ def examine_fit(found: KnownDistances) -> tuple[Floats, list[Finding]]:
     ]
 
 
-def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> Iterator[Family]:
+def families(found: RangeFit, louder_m: Floats, *, beside_curve: bool) -> Iterator[Family]:
     """Yield the alternatives: offsets of a pair, of a tag for a while, of either in one of several sessions, of a tag
     with its power, and of all ranges together.
 
@@ -133,7 +133,7 @@ def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> 
         yield Family(kind="shared", names=list(shared), derivative=Derivative(everyone, values, len(shared)))
 
 
-def _of_heard(found: KnownDistances) -> Iterator[Family]:
+def _of_heard(found: RangeFit) -> Iterator[Family]:
     """Yield offsets of differences of arrival: of targets, if their ranges contradict these, and of paths
     to listeners.
     """
@@ -148,7 +148,7 @@ def _of_heard(found: KnownDistances) -> Iterator[Family]:
         yield Family(kind="path", names=arrivals.paths, derivative=path, fitted=fitted)
 
 
-def of_pairs(found: KnownDistances) -> Family:
+def of_pairs(found: RangeFit) -> Family:
     """Return the alternatives: an offset of each pair."""
     pairs = found.model.pairs
     return Family(
@@ -159,7 +159,7 @@ def of_pairs(found: KnownDistances) -> Family:
     )
 
 
-def _of_sessions(found: KnownDistances, tags: list[str], ends: Ints) -> Family:
+def _of_sessions(found: RangeFit, tags: list[str], ends: Ints) -> Family:
     """Return offsets of tags, and of pairs, in one session; only of tags if the time is too short for both.
 
     Between sessions antennas are removed and mounted, and objects are moved.
@@ -218,7 +218,7 @@ def _root_mean_square(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def change_per_decibel(found: KnownDistances) -> Floats:
+def change_per_decibel(found: RangeFit) -> Floats:
     """Return the change of ranges (n,) for powers that are a decibel higher."""
     curves, lifted = list(bias_curves(found).values()), found.model.lifted
     return np.asarray(np.mean([curve(10**0.1 * lifted) - curve(lifted) for curve in curves], axis=0))
@@ -262,7 +262,7 @@ def _covariance_and_findings(
             matter.setdefault((one.kind, one.names), one)
     named = [*places, *map(finding_of, matter.values())]
     noisy = any(one.kind == "readings" for one in findings)
-    return covariance, [_or_noise(one) if noisy and _like_noise(one) else one for one in named]
+    return covariance, [_with_noisy_powers(one) if noisy and _may_be_noisy_powers(one) else one for one in named]
 
 
 def _largest_shift(finding: FoundOffset, covariance: Floats) -> float:
@@ -338,22 +338,22 @@ def finding_of(offset: FoundOffset) -> Finding:
         "others": others,
     }
     names = [name for name in offset.names if name in OFFSET_FAULTS] if offset.kind == "shared" else [offset.kind]
-    return either(
+    return combined(
         [warning(OFFSET_FAULTS[name][0], OFFSET_FAULTS[name][1].format(**words), offset.p_value) for name in names]
     )
 
 
-def _like_noise(found: Finding) -> bool:
+def _may_be_noisy_powers(found: Finding) -> bool:
     """Return whether noise of power readings may have the same effect: on errors of places and of true distances."""
     return found.fault == "errors of places" or "true distances" in found.fault
 
 
-def _or_noise(found: Finding) -> Finding:
+def _with_noisy_powers(found: Finding) -> Finding:
     noise = warning("noisy powers", "the powers are noisy, which has the same effect", found.p_value)
-    return either([found, noise])
+    return combined([found, noise])
 
 
-def _reflections(found: KnownDistances) -> Iterator[Finding]:
+def _reflections(found: RangeFit) -> Iterator[Finding]:
     """Yield findings about pairs with hardly any direct range, or otherwise about a tag with about half of its ranges
     reflected.
 
@@ -388,7 +388,7 @@ def _reflections(found: KnownDistances) -> Iterator[Finding]:
         yield warning("reflections of a tag", f"tag {tag}: {100 * means[tag]:.0f} % of its ranges are reflected")
 
 
-def _persistence(found: KnownDistances) -> Iterator[Finding]:
+def _persistence(found: RangeFit) -> Iterator[Finding]:
     """Yield a finding if errors last so long that there are few independent stretches of time."""
     lasting = found.persistence
     if lasting.stretches < FEWEST_STRETCHES:
@@ -414,7 +414,7 @@ def _redundancy(model: RangeModel) -> Iterator[Finding]:
         )
 
 
-def _confounding(found: KnownDistances, slopes: Slopes) -> Iterator[Finding]:
+def _confounding(found: RangeFit, slopes: Slopes) -> Iterator[Finding]:
     """Yield a finding if a small error proportional to distance cannot be separated from a curve over power.
 
     The curve is fitted with such an error of 1 %, which true distances may have unnoticed (a judgement). It is named if

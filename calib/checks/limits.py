@@ -5,6 +5,7 @@ Impossible data are refused; doubtful data get a warning.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
@@ -16,9 +17,9 @@ from calib.checks.residuals import ONE_WAY_M
 from calib.data.clocks import as_length, corrected
 from calib.data.ranges import NO_STAMPS, STATIC, Ranges, growth_fault, look_like
 from calib.errors import UnanswerableError
-from calib.estimator.known_distances import KnownDistances
-from calib.findings import SMALLEST_NS, Finding, warning
-from calib.spread import STD_OF_MEDIAN, TWO_SIDED_95, medians, robust_spread, spreads
+from calib.estimator.known_distances import RangeFit
+from calib.findings import FIT_LEVELS, SMALLEST_NS, STRETCHES, Finding, exceeds, warning
+from calib.spread import TWO_SIDED_95, medians, robust_spread
 from uwblink.arrays import Floats
 from uwblink.protocols.table import is_single_sided
 from uwblink.recording.antenna_delays import known_delays
@@ -34,7 +35,7 @@ REGISTER_NS: Final = 65_536 * TICK_S * 1e9
 A larger delay is a length in the wrong unit: 154 m of range per tag."""
 
 
-def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Mapping[int, float]) -> Iterator[Finding]:
+def limits(found: RangeFit, ranges: Ranges, residuals_m: Floats, fixed: Mapping[int, float]) -> Iterator[Finding]:
     """Yield findings about undetermined values; `residuals_m` (n,) are fully corrected errors."""
     model, pairs, count = found.model, found.model.settings.constants == "pair", len(found.model.pairs.ends)
     bare = int(np.count_nonzero(ranges.protocol == NO_STAMPS))
@@ -46,8 +47,8 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
             f"corrections by the device itself, are unknown and contained in the {'constants' if pairs else 'delays'}; "
             f"damaged ranges cannot be distinguished from reflected ones",
         )
-    if ranges.left_skew is not None:
-        yield warning("clock skew", str(ranges.left_skew))
+    if ranges.uncorrected_skew is not None:
+        yield warning("clock skew", str(ranges.uncorrected_skew))
     elif unread:
         yield warning(
             "clock skew",
@@ -55,7 +56,7 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
             "contained in the antenna delays",
         )
     if ranges.clocks_apart is not None:
-        yield warning("clocks contradict the carriers", str(ranges.clocks_apart))
+        yield warning("clocks contradict the carriers", str(ranges.clocks_apart), ranges.clocks_apart.p_value)
     if pairs:
         yield warning(
             "constants of pairs",
@@ -74,7 +75,7 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
         )
 
 
-def _without_curve(found: KnownDistances, ranges: Ranges, residuals_m: Floats) -> Finding:
+def _without_curve(found: RangeFit, ranges: Ranges, residuals_m: Floats) -> Finding:
     if not found.model.settings.delays_only and found.model.powered.any():
         return warning(
             "constant power",
@@ -141,37 +142,47 @@ def _impossible(ranges: Ranges) -> Iterator[str]:
 
 
 def dependence_on_initiator(ranges: Ranges) -> Iterator[Finding]:
-    """Yield a finding about the pair whose ranges depend most on the initiator, a sign of uncorrected clock skew.
+    """Yield a finding about a pair whose ranges depend on the initiator, a sign of uncorrected clock skew.
 
     Medians of raw errors show it even if a fit takes such ranges for reflections.
     """
     ways = _medians_by_way(ranges.error_m, ranges)
-    # Standard errors are for independent ranges. In the simulator's room, errors that last make variances of sums up to
-    # 15 times as large, so eight of these standard errors are about two, and more is not by chance.
-    differ_m = {
-        (a, b): middle - ways[b, a][0]
-        for (a, b), (middle, std) in ways.items()
-        if a < b and (b, a) in ways and abs(middle - ways[b, a][0]) > max(ONE_WAY_M, 8.0 * np.hypot(std, ways[b, a][1]))
-    }
-    if differ_m:
-        a, b = max(differ_m, key=lambda pair: abs(differ_m[pair]))
-        yield warning(
-            "clock skew",
-            f"pair {a}-{b}: ranges are {100 * abs(differ_m[a, b]):.0f} cm "
-            f"{'longer' if differ_m[a, b] > 0 else 'shorter'} if tag {a} initiates: clock skew is not corrected, or "
-            f"the carrier reading has the wrong sign",
-        )
+    both = {(a, b): _mean_of_stretches(m - ways[b, a]) for (a, b), m in ways.items() if a < b and (b, a) in ways}
+    tested = [
+        (exceeds(mean_m, std, STRETCHES - 1, tolerance=ONE_WAY_M, tried=len(both)), -abs(mean_m), pair)
+        for pair, (mean_m, std) in both.items()
+    ]
+    for p_value, _, (a, b) in sorted(tested)[:1]:
+        if p_value < FIT_LEVELS["directions"]:
+            mean_m = both[a, b][0]
+            yield warning(
+                "clock skew",
+                f"pair {a}-{b}: ranges are {100 * abs(mean_m):.0f} cm {'longer' if mean_m > 0 else 'shorter'} if tag "
+                f"{a} initiates: clock skew is not corrected, or the carrier reading has the wrong sign",
+                p_value,
+            )
 
 
-def _medians_by_way(values: Floats, ranges: Ranges) -> dict[tuple[int, int], tuple[float, float]]:
-    """Return the median of at least 20 finite values (n,) by (initiator, target), with its standard error."""
+def _medians_by_way(values: Floats, ranges: Ranges) -> dict[tuple[int, int], Floats]:
+    """Return medians (`STRETCHES`,) of finite values (n,) in stretches of time, by (initiator, target).
+
+    The stretches of a way have equal counts; ways with fewer than 20 values are left out.
+    """
     known = np.isfinite(values)
-    link, number, count = np.unique(
-        (ranges.initiator * 65_536 + ranges.target)[known], return_inverse=True, return_counts=True
-    )
-    std = STD_OF_MEDIAN * spreads(values[known], number) / np.sqrt(count)
-    found = zip(link.tolist(), medians(values[known], number).tolist(), std.tolist(), count.tolist(), strict=True)
-    return {divmod(of, 65_536): (middle, error) for of, middle, error, several in found if several >= 20}
+    link = (ranges.initiator * 65_536 + ranges.target)[known]
+    order = np.lexsort((ranges.time_ns[known], link))
+    own = values[known][order]
+    which, first, count = np.unique(link[order], return_index=True, return_counts=True)
+    return {
+        divmod(of, 65_536): np.array([np.median(part) for part in np.array_split(own[start : start + n], STRETCHES)])
+        for of, start, n in zip(which.tolist(), first.tolist(), count.tolist(), strict=True)
+        if n >= 20
+    }
+
+
+def _mean_of_stretches(values: Floats) -> tuple[float, float]:
+    """Return the mean of values (`STRETCHES`,) of stretches of time, and its standard error by their scatter."""
+    return float(np.mean(values)), float(np.std(values, ddof=1)) / math.sqrt(len(values))
 
 
 def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: Ranges) -> None:
@@ -196,14 +207,11 @@ def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: 
     )
 
 
-LEAST_INLIERS: Final = 0.5
-"""Minimum share of ranges within three sigmas of a credible fit; for direct ranges it is 99.7 %. If more than half are
-reflected, delays depend on the minority; invented places leave 0 to 34 % (swarm broadcasts)."""
-
-
 def refuse_contradicted(inliers: float, ranges: Ranges, findings: Sequence[Finding]) -> None:
     """Raise `UnanswerableError`, with the findings, if most ranges contradict their own fit."""
-    if inliers < LEAST_INLIERS:
+    # Of direct ranges 99.7 % lie within. If more than half are reflected, delays depend on the minority; invented
+    # places leave 0 to 34 % (swarm broadcasts).
+    if inliers < 0.5:
         evidence = "; ".join(map(str, findings)) or "no single tag or pair explains it"
         raise UnanswerableError(
             f"{ranges.source}: {100 * (1 - inliers):.0f} % of the ranges lie outside three sigmas of this fit, which "
@@ -224,7 +232,7 @@ def implausible_values(delays_ns: Mapping[int, float], residuals_m: Floats) -> I
         yield warning("large errors", f"errors spread by {spread:.2f} m after the fit, more than those of UWB ranges")
 
 
-def doubts_about_data(ranges: Ranges, inliers: float, seconds: float) -> Iterator[Finding]:
+def limits_of_data(ranges: Ranges, inliers: float, seconds: float) -> Iterator[Finding]:
     """Yield findings about the data of a fit, the most serious first.
 
     `inliers` is the share of ranges within three sigmas, `seconds` the time that ranges cover.
@@ -254,7 +262,7 @@ SAME_LEVEL_DB: Final = 0.5
 """Smaller differences of levels of tags are ignored; medians of a pair's ranges are known to a tenth of this."""
 
 
-def unlike_power_levels(ranges: Ranges, calibration: Calibration) -> Iterator[Finding]:
+def differing_power_levels(ranges: Ranges, calibration: Calibration) -> Iterator[Finding]:
     """Yield a finding about tags whose powers differ from the others so much that their delays may contain an error.
 
     A frame and its answer take the same path, so a difference of their powers is due to the tags: transmit power and
@@ -266,43 +274,44 @@ def unlike_power_levels(ranges: Ranges, calibration: Calibration) -> Iterator[Fi
         return
     each_ns = _ns_a_decibel(ranges, calibration)
     half_ns = {tag: TWO_SIDED_95 * calibration.delays_std_ns.get(tag, 0.0) for tag in levels}
-    unlike = {
-        tag: level
+    differing = {
+        tag: (level, p_value)
         for tag, (level, std) in levels.items()
         if half_ns[tag] > 0
-        # Readings at one place follow each other, so standard errors are slightly too small.
-        and abs(level) > max(SAME_LEVEL_DB, 4.0 * std)
         and abs(level) * each_ns > max(half_ns[tag], SMALLEST_NS)
+        and (p_value := exceeds(level, std, STRETCHES - 1, tolerance=SAME_LEVEL_DB, tried=len(levels)))
+        < FIT_LEVELS["powers"]
     }
-    if unlike:
-        named = ", ".join(f"{tag} ({level:+.1f} dB)" for tag, level in unlike.items())
-        held_ps = 1e3 * each_ns * max(map(abs, unlike.values()))
+    if differing:
+        named = ", ".join(f"{tag} ({level:+.1f} dB)" for tag, (level, _) in differing.items())
+        held_ps = 1e3 * each_ns * max(abs(level) for level, _ in differing.values())
         yield warning(
             "power levels of tags",
-            f"powers of tag{'s' * (len(unlike) > 1)} {named} differ from the others: the tags measure powers "
+            f"powers of tag{'s' * (len(differing) > 1)} {named} differ from the others: the tags measure powers "
             f"wrongly, or transmit with another power; wrong powers change a tag's delay by up to {held_ps:.0f} ps "
             f"here, which is right for ranges but not for the antenna",
+            min(p_value for _, p_value in differing.values()),
         )
 
 
 def power_levels_db(ranges: Ranges) -> dict[int, tuple[float, float]]:
     """Return the excess of powers that each tag measures minus the excess that it transmits, relative to most others.
 
-    In dB, each with its standard error; tags without a pair that has enough ranges with both powers are left out.
+    In dB, each with its standard error, by the scatter between stretches of time; tags without a pair that has enough
+    ranges with both powers are left out.
     """
     # The initiator reads the target's frame, and the target the initiator's.
     ways = _medians_by_way(ranges.fpp2_dbm - ranges.fpp1_dbm, ranges)
     if not ways:
         return {}
-    ends, (middle, std) = np.array([*ways]).T, np.array([*ways.values()]).T
+    ends = np.array([*ways]).T
     tags = np.unique(ends)
     inverse = np.linalg.pinv(np.subtract(*(np.equal.outer(end, tags).astype(float) for end in ends)))
-    levels: Floats = inverse @ middle
-    near = np.abs(np.subtract.outer(levels, levels)) < SAME_LEVEL_DB
-    levels -= levels[near[np.argmax(near.sum(axis=1))]].mean()
-    return dict(
-        zip(tags.tolist(), zip(levels.tolist(), np.sqrt(inverse**2 @ std**2).tolist(), strict=True), strict=True)
-    )
+    levels: Floats = inverse @ np.array([*ways.values()])
+    mean = levels.mean(axis=1)
+    near = np.abs(np.subtract.outer(mean, mean)) < SAME_LEVEL_DB
+    levels -= levels[near[np.argmax(near.sum(axis=1))]].mean(axis=0)
+    return {tag: _mean_of_stretches(own) for tag, own in zip(tags.tolist(), levels, strict=True)}
 
 
 def _ns_a_decibel(ranges: Ranges, calibration: Calibration) -> float:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
-from calib.estimator.known_distances import KnownDistances
+from calib.estimator.known_distances import RangeFit
 from calib.estimator.score_tests import Slopes, Tested
 from calib.estimator.time_blocks import TimeBlocks
 from calib.findings import BUDGET, FIT_LEVELS, SMALLEST_NS, Finding, warning
@@ -32,7 +32,7 @@ SIZES_M = np.geomspace(3e-4, 0.2, 60)
 
 
 def place_covariance(
-    found: KnownDistances, slopes: Slopes, pairs: Tested, before_ns2: Floats
+    found: RangeFit, slopes: Slopes, pairs: Tested, before_ns2: Floats
 ) -> tuple[Floats, list[Finding]]:
     """Return the covariance (tags, tags) that place-dependent errors add to that of the delays, and a finding if they
     matter.
@@ -100,7 +100,7 @@ def _deviation_of_mixture(likely: Floats) -> float:
     return float(np.interp(0.95, within @ (weight / weight.sum()), SIZES_M))
 
 
-def _pairs_of_bodies(found: KnownDistances) -> Ints | None:
+def _pairs_of_bodies(found: RangeFit) -> Ints | None:
     """Return the number of the two bodies of each pair (pairs,); None if no two pairs have the same bodies."""
     carried = dict(found.model.ranges.bodies)
     if found.model.settings.constants == "pair" or not carried:
@@ -130,7 +130,7 @@ def _constant_part(pairs: Tested, sums: Floats) -> tuple[Floats, Floats]:
     return np.clip(turned.T @ root.T @ total, -largest, largest), reach
 
 
-def _varying_part(found: KnownDistances, slopes: Slopes, sums: Floats) -> tuple[float, float]:
+def _varying_part(found: RangeFit, slopes: Slopes, sums: Floats) -> tuple[float, float]:
     """Return the variance of varying errors that pairs of a group share, and its deviation from zero in standard
     errors.
 
@@ -161,7 +161,7 @@ def _seconds(blocks: TimeBlocks) -> Ints:
     return np.asarray(blocks.number // each)
 
 
-def _simultaneous_reflections(found: KnownDistances, group: Ints) -> float:
+def _simultaneous_reflections(found: RangeFit, group: Ints) -> float:
     """Return the significance of simultaneous reflections of different pairs of a group (pairs,), in standard
     deviations.
 

@@ -269,7 +269,7 @@ def show(
     shown = {name: provenance.get(name) for name in ("fitted", "gauge", "recordings", "settings")}
     lines = [
         *(f"{name}: {_listed(value)}" for name, value in shown.items() if value),
-        *([f"distances: {distances}"] if distances else _survey_lines(provenance.get("rests_on"))),
+        *([f"distances: {distances}"] if distances else _survey_lines(provenance.get("geometry"))),
         *([f"age: {age}"] if (age := calib.calibration.age_line(known)) else []),
     ]
     warnings = (f"warning: {with_flags(text)}" for text in calib.calibration.warnings_of(known))

@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.findings import FIT_LEVELS, exceeds
 from calib.pairs import pairs_of
 from calib.spread import STD_OF_MEDIAN, medians, spreads
 from uwblink.protocols.table import PROTOCOLS, Intervals, is_single_sided
@@ -22,13 +23,15 @@ PPM_TO_METRES: Final = 0.5 * SPEED_OF_LIGHT * 1e-6
 class ClocksApart:
     """A pair, the smaller id first, with different relative clock skews by stamps and by carriers, in ppm.
 
-    `moves_m` is the error of its ranges if the stamps are wrong.
+    `moves_m` is the error of its ranges if the stamps are wrong, `p_value` the probability of such a difference between
+    sound readings.
     """
 
     pair: tuple[int, int]
     stamps_ppm: float
     carrier_ppm: float
     moves_m: float
+    p_value: float
 
     def __str__(self) -> str:
         """Return a sentence about the fault."""
@@ -45,8 +48,8 @@ def clocks_apart(exchanges: Exchanges) -> ClocksApart | None:
 
     The comparison uses exchanges with three messages and readings of the carrier integrator; a reading of 0 means that
     it was not read. The sign of the readings is not known, because ranges with three messages do not depend on it: the
-    sign with the better agreement over all pairs is used. Pairs agree if the median difference is below 1 ppm, below a
-    tenth of the skew, or below eight standard errors, and pairs with fewer than 20 exchanges are ignored (judgements).
+    sign with the better agreement over all pairs is used. Median differences up to 1 ppm or a tenth of the skew are
+    tolerated, and pairs with fewer than 20 exchanges are ignored (judgements).
     """
     readings = np.abs(exchanges.skew1_ppm) + np.abs(exchanges.skew2_ppm)
     triple = [name for name in names_in(exchanges.protocol) if PROTOCOLS[name].third_sender is not None]
@@ -63,27 +66,33 @@ def clocks_apart(exchanges: Exchanges) -> ClocksApart | None:
     sign = 1.0 if np.sum((by_stamps * by_carrier)[enough]) >= 0 else -1.0
     differ, by_carrier = medians(stamps - sign * carrier, pair), sign * by_carrier
     std = STD_OF_MEDIAN * spreads(stamps - sign * carrier, pair) / np.sqrt(count)
-    apart = np.abs(differ) >= np.maximum.reduce([np.ones(len(count)), 8.0 * std, 0.1 * np.abs(by_carrier)])
+    tolerance = np.maximum(1.0, 0.1 * np.abs(by_carrier))
+    p_values = np.array(
+        [
+            exceeds(float(value), float(error), several - 1, tolerance=float(least), tried=int(enough.sum()))
+            for value, error, several, least in zip(differ, std, count.tolist(), tolerance, strict=True)
+        ]
+    )
     moves_m = PPM_TO_METRES * np.abs(differ) * medians(intervals(some).dt32 * TICK_S, pair)
-    moves_m = np.where(apart & enough, moves_m, 0.0)
+    moves_m = np.where((p_values < FIT_LEVELS["clocks"]) & enough, moves_m, 0.0)
     if not moves_m.any():
         return None
     k = int(np.argmax(moves_m))
     low, high = sorted((int(some.initiator[first[k]]), int(some.target[first[k]])))
-    return ClocksApart((low, high), float(by_stamps[k]), float(by_carrier[k]), float(moves_m[k]))
+    return ClocksApart((low, high), *(float(one[k]) for one in (by_stamps, by_carrier, moves_m, p_values)))
 
 
 @dataclass(frozen=True, slots=True)
-class LeftSkew:
+class UncorrectedSkew:
     """Errors of single-sided ranges by clock skew, in metres.
 
-    `bound_m` is the error for crystals at the ends of their tolerance, with the median reply time `reply_s`. `told_m`
+    `bound_m` is the error for crystals at the ends of their tolerance, with the median reply time `reply_s`. `read_m`
     is the 95 % quantile of the errors that follow from readings of the carrier integrators, NaN without readings.
     """
 
     bound_m: float
     reply_s: float
-    told_m: float
+    read_m: float
 
     def __str__(self) -> str:
         """Return the bound as a sentence."""
@@ -91,14 +100,14 @@ class LeftSkew:
             f"two clocks with errors of 20 ppm each cause up to {as_length(self.bound_m)} "
             f"(c/2 x 40 ppm x {1e6 * self.reply_s:.0f} µs of reply)"
         )
-        if not np.isfinite(self.told_m):
+        if not np.isfinite(self.read_m):
             return (
                 f"single-sided ranges without carrier readings: {bound}, which has the effect of an antenna delay "
                 f"with opposite signs for the two initiators"
             )
         return (
             f"single-sided ranges with clock skew in them: {bound}, and by the carriers' readings up to "
-            f"{as_length(self.told_m)}; imported with protocol ss-cfo they are corrected with the readings"
+            f"{as_length(self.read_m)}; imported with protocol ss-cfo they are corrected with the readings"
         )
 
 
@@ -109,7 +118,7 @@ def as_length(metres: float) -> str:
     return f"{100 * metres:.0f} cm" if metres >= 0.01 else f"{1e3 * metres:.1f} mm"
 
 
-def left_skew(exchanges: Exchanges) -> LeftSkew | None:
+def uncorrected_skew(exchanges: Exchanges) -> UncorrectedSkew | None:
     """Return the errors by skew of single-sided ranges with stamps and without skew correction; None without any.
 
     A single-sided time of flight is (round trip - reply) / 2. If the clocks differ by the relative rate s, its error is
@@ -121,10 +130,10 @@ def left_skew(exchanges: Exchanges) -> LeftSkew | None:
         return None
     reply_s = intervals(some).dt32 * TICK_S
     median_s, known = float(np.median(reply_s)), np.isfinite(some.skew2_ppm) & (some.skew2_ppm != 0)
-    told_m = (np.abs(some.skew2_ppm) * PPM_TO_METRES * reply_s)[known]
+    read_m = (np.abs(some.skew2_ppm) * PPM_TO_METRES * reply_s)[known]
     # Each of two crystals may be off its frequency by 20 ppm (IEEE 802.15.4, 15.4.9).
     bound_m = 2 * 20.0 * PPM_TO_METRES * median_s
-    return LeftSkew(bound_m, median_s, float(np.quantile(told_m, 0.95)) if len(told_m) else np.nan)
+    return UncorrectedSkew(bound_m, median_s, float(np.quantile(read_m, 0.95)) if len(read_m) else np.nan)
 
 
 def corrected(protocol: str) -> bool:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from calib.data.arrivals import LARGEST_ERROR_M, Arrivals
-from calib.data.clocks import ClocksApart, LeftSkew, clocks_apart, left_skew
+from calib.data.clocks import ClocksApart, UncorrectedSkew, clocks_apart, uncorrected_skew
 from calib.errors import BadInputError, UnanswerableError
 from calib.pairs import Pairs, pairs_of
 from calib.spread import less_medians, robust_spread
@@ -70,15 +70,15 @@ class Ranges(ColumnTable):
     `sessions` are their names: each recording is a session, except that recordings at the same time are one.
 
     `excluded` counts the ranges that were left out, by reason; `planted` are the parameters of a simulation, for
-    display only; `recordings` are names and fingerprints of the recordings, empty for ranges of arrays; `left_skew` are
-    errors of single-sided ranges by clock skew, None without such ranges; `clocks_apart` is the pair whose clock skews
-    by stamps and by carriers differ most, None if all agree; `bodies` are pairs of a tag and its body; `antenna_delays`
-    are those programmed into the tags, if known; `arrivals` are the differences of arrival at tags that overheard these
-    exchanges, None without any. `toward` (n, 2, 3) are unit vectors from the antennas of initiator and target to each
-    other, in the frames of their bodies, NaN if attitudes are unknown; `turning` are the tags on bodies that turn.
-    `temperature_c` (n, 2) are the temperatures of initiator and target, NaN without a reading near in time;
-    `features` (n, 2) are the `FEATURES` of their receptions, NaN if unknown. `supply_v_per_k` is the change of a tag's
-    supply voltage per kelvin, for tags that measure both.
+    display only; `recordings` are names and fingerprints of the recordings, empty for ranges of arrays;
+    `uncorrected_skew` are errors of single-sided ranges by clock skew, None without such ranges; `clocks_apart` is the
+    pair whose clock skews by stamps and by carriers differ most, None if all agree; `bodies` are pairs of a tag and its
+    body; `antenna_delays` are those programmed into the tags, if known; `arrivals` are the differences of arrival at
+    tags that overheard these exchanges, None without any. `toward` (n, 2, 3) are unit vectors from the antennas of
+    initiator and target to each other, in the frames of their bodies, NaN if attitudes are unknown; `turning` are the
+    tags on bodies that turn. `temperature_c` (n, 2) are the temperatures of initiator and target, NaN without a reading
+    near in time; `features` (n, 2) are the `FEATURES` of their receptions, NaN if unknown. `supply_v_per_k` is the
+    change of a tag's supply voltage per kelvin, for tags that measure both.
 
     A row with a `listener` (-1 in others) is a difference of arrival without stamps: the listener's distance to the
     target minus its distance to the initiator. The weight of its initiator is negative.
@@ -97,7 +97,7 @@ class Ranges(ColumnTable):
     fpp2_dbm: Floats
     excluded: dict[str, int]
     planted: dict[str, Any] | None
-    left_skew: LeftSkew | None = None
+    uncorrected_skew: UncorrectedSkew | None = None
     clocks_apart: ClocksApart | None = None
     recordings: tuple[tuple[str, str], ...] = ()
     bodies: tuple[tuple[int, str], ...] = ()
@@ -175,7 +175,7 @@ class Ranges(ColumnTable):
             fpp2_dbm=measured_powers(exchanges.fpp2_dbm),
             excluded={},
             planted=dict(planted) if planted else None,
-            left_skew=left_skew(exchanges),
+            uncorrected_skew=uncorrected_skew(exchanges),
             clocks_apart=clocks_apart(exchanges),
             bodies=tuple((tag.tag, tag.body) for tag in tags),
             antenna_delays=antenna_delays or {},
@@ -512,7 +512,7 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
     Raises `BadInputError` if a tag had different programmed antenna delays in two recordings.
     """
     session, names = _sessions(parts)
-    skews = [part.left_skew for part in parts if part.left_skew]
+    skews = [part.uncorrected_skew for part in parts if part.uncorrected_skew]
     apart = [part.clocks_apart for part in parts if part.clocks_apart]
     bodies = {one for part in parts for one in part.bodies}
     reasons = sorted({reason for part in parts for reason in part.excluded})
@@ -520,7 +520,7 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
         Ranges.concatenate(parts),
         source=", ".join(part.source for part in parts),
         excluded={reason: sum(part.excluded.get(reason, 0) for part in parts) for reason in reasons},
-        left_skew=max(skews, key=lambda one: one.bound_m, default=None),
+        uncorrected_skew=max(skews, key=lambda one: one.bound_m, default=None),
         clocks_apart=max(apart, key=lambda one: one.moves_m, default=None),
         recordings=tuple(one for part in parts for one in part.recordings),
         # If a tag was on different bodies, no tag has a known body.

@@ -28,7 +28,7 @@ from calib.data.ranges import (
     without_static,
 )
 from calib.errors import BadInputError, TemperatureWarning, UnanswerableError
-from uwblink.arrays import Floats, is_frame
+from uwblink.arrays import Floats, Ints, is_frame
 from uwblink.display import printable
 from uwblink.errors import warn
 from uwblink.recording.antenna_delays import AntennaDelays, delays_in_meta
@@ -163,14 +163,21 @@ def load_each(
         else load_flight(one, need_power=need_power, use=use).ranges
         for one in given
     ]
-    loaded = [part for one, part in zip(given, parts, strict=True) if not isinstance(one, Ranges)]
-    refuse_repeated(recording for part in loaded for recording in part.recordings)
+    # Parts of one recording are `Ranges` with the same fingerprint of the recording, but with other rows.
+    contents = [
+        ((part.source, _hashed(part.time_ns, part.raw_m)),) if isinstance(one, Ranges) else part.recordings
+        for one, part in zip(given, parts, strict=True)
+    ]
+    refuse_repeated(recording for several in contents for recording in several)
     return [without_static(part) for part in parts] if trim_static else parts
 
 
 def fingerprint_of(exchanges: Exchanges, *more: Floats) -> str:
     """Return a fingerprint of exchanges, and of `more` columns."""
-    columns = (exchanges.time_ns, exchanges.range_m, *more)
+    return _hashed(exchanges.time_ns, exchanges.range_m, *more)
+
+
+def _hashed(*columns: Floats | Ints) -> str:
     return sha256(b"".join(column.tobytes() for column in columns)).hexdigest()[:32]
 
 

@@ -92,8 +92,10 @@ class Fitted:
 
 
 @dataclass(frozen=True, kw_only=True)
-class KnownDistances:
-    """A fit to known distances: its `model`, the search that ended it, and the covariances of the fitted values.
+class RangeFit:
+    """A fit to ranges: its `model`, the searches that ended it, and the covariances of the fitted values.
+
+    Distances were known, or estimated along with trajectories.
 
     `values` are unknowns by kind, `covariances` the covariances of "delay", of all curves together ("curve"), of the
     noise ("noise"), of patterns over direction ("pattern") and of delays and slopes over temperature ("temperature").
@@ -128,7 +130,7 @@ class KnownDistances:
         return sum(search.steps for search in self.searches)
 
 
-def fit_known_distances(ranges: Ranges, settings: FitSettings) -> KnownDistances:
+def fit_known_distances(ranges: Ranges, settings: FitSettings) -> RangeFit:
     """Fit delays, curves, offsets and errors.
 
     Raises `UnanswerableError` if there are too few ranges, and `BadInputError` for pinned tags or groups that are not
@@ -299,7 +301,7 @@ def _maximize_by_samples(
     return found, steps + found.steps
 
 
-def with_covariances(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> KnownDistances:
+def with_covariances(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> RangeFit:
     """Return a fit with the covariances of the fitted values."""
     layout = fitted.optimum.layout
     kept = {
@@ -316,7 +318,7 @@ def with_covariances(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> K
     covariances = {name: matrix for name, (matrix, _) in found.items()}
     if "offset of pair" in layout.where and "odds of pair" in layout.where:
         covariances["delay"] = covariances["delay"] + _covariance_of_other_detours(fitted.optimum)
-    return KnownDistances(
+    return RangeFit(
         model=model,
         values=model.at_reference(fitted.optimum.by_kind()),
         covariances=covariances,
@@ -355,7 +357,7 @@ def _covariance_of_other_detours(optimum: Optimum) -> Floats:
 
 def _fit_in_sequence(
     model: RangeModel, error: Floats, loss: str, scale_m: float | None, blocks: TimeBlocks
-) -> KnownDistances:
+) -> RangeFit:
     """Fit delays first, then the curves to the residuals, as in ICRA 2023, sections III and IV, with splines.
 
     The curves keep their constants and the delays are from the first step, unless a reference power is given.
@@ -391,7 +393,7 @@ class DescribedErrors:
     location_m: float
 
 
-def described_errors(found: KnownDistances) -> DescribedErrors:
+def described_errors(found: RangeFit) -> DescribedErrors:
     """Return the error model: the fitted one, or one fitted to the residuals of a robust loss."""
     search, model, location = found.searches[-1], found.model, 0.0
     values, rows, x = found.values, search.rows, search.optimum.x

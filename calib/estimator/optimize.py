@@ -75,6 +75,9 @@ def maximize(  # noqa: PLR0913 - a search has that many sides
 ) -> Optimum:
     """Search from unknowns (p,) for the likeliest ones; `asked` unknowns converge more closely.
 
+    The weights of `priors` are estimated in the first `evidence_steps` near the optimum, and changed in place: a next
+    search with the same object continues with them.
+
     `longest` returns which share of a step (p,) may be taken at most, where unknowns are not linear; `longer` limits
     corrected steps, as `LONGER` says.
 

@@ -21,7 +21,7 @@ from calib.calibration.patterns import HARMONICS, Pattern, TemperatureSlope
 from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, basis, flat_curve
 from calib.estimator.covariates import COMMON, OF_PLACES, OWN, OWN_WARMTH, WARMTH
 from calib.estimator.grouped_errors import ReflectionFeatures
-from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, KnownDistances, described_errors
+from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, RangeFit, described_errors
 from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel
 from calib.estimator.range_rows import RESIDUAL
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
@@ -63,7 +63,7 @@ manual, section 8.3.1) whose temperatures differ by 10 K. Chosen without STAR-lo
 """
 
 
-def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
+def calibration_of(found: RangeFit, delays_ns2: Floats) -> Calibration:
     """Return the calibration of a fit; `delays_ns2` (tags, tags) is the covariance of its delays."""
     model, search, settings = found.model, found.searches[0], found.model.settings
     names, fixed = model.unknowns[0].names, settings.fixed_ns
@@ -118,7 +118,7 @@ def calibration_of(found: KnownDistances, delays_ns2: Floats) -> Calibration:
     )
 
 
-def patterns_of(found: KnownDistances) -> tuple[Pattern, ...]:
+def patterns_of(found: RangeFit) -> tuple[Pattern, ...]:
     """Return the patterns over direction of a fit: one for all tags, or one for each tag."""
     directions, values = found.model.covariates.get("pattern"), found.values
     if directions is None:
@@ -134,7 +134,7 @@ def patterns_of(found: KnownDistances) -> tuple[Pattern, ...]:
     return tuple(patterns)
 
 
-def temperatures_of(found: KnownDistances) -> tuple[TemperatureSlope, ...]:
+def temperatures_of(found: RangeFit) -> tuple[TemperatureSlope, ...]:
     """Return the slopes over temperature of a fit: one for all tags, or one for each tag."""
     known, values = found.model.covariates.get("temperature"), found.values
     if known is None:
@@ -151,7 +151,7 @@ def temperatures_of(found: KnownDistances) -> tuple[TemperatureSlope, ...]:
     return tuple(TemperatureSlope(tags, slope, error, float(known.centre[0]), span) for tags, slope, error in rows)
 
 
-def bias_curves(found: KnownDistances) -> dict[str, Curve]:
+def bias_curves(found: RangeFit) -> dict[str, Curve]:
     """Return the curve of each group, zero at the reference power if delays absorb its constant."""
     model = found.model
     if model.curve is None:
@@ -193,7 +193,7 @@ def _flat_sigma(model: RangeModel, sigma_m: float, variance: float) -> tuple[dic
     return curves, np.full((DEGREE + 1,) * 2, value**2 * variance)
 
 
-def _correction_std(found: KnownDistances, delays_ns2: Floats, lifted: Floats) -> Floats:
+def _correction_std(found: RangeFit, delays_ns2: Floats, lifted: Floats) -> Floats:
     """Return the standard deviation of the correction at lifted powers (nodes,), in metres: the root mean square over
     the fitted pairs.
 
@@ -217,7 +217,7 @@ def _correction_std(found: KnownDistances, delays_ns2: Floats, lifted: Floats) -
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _bias_covariance(found: KnownDistances) -> Floats:
+def _bias_covariance(found: RangeFit) -> Floats:
     """Return the covariance of the coefficients of the average of the groups' curves."""
     if found.model.curve is None:
         return np.zeros((DEGREE + 1,) * 2)
@@ -283,7 +283,7 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
     return _with_quantiles(stated, model, residual)
 
 
-def between_recordings(found: KnownDistances, errors: DescribedErrors) -> float:
+def between_recordings(found: RangeFit, errors: DescribedErrors) -> float:
     """Return the standard deviation, in metres, of the difference of a pair's offset between this and another
     recording.
 

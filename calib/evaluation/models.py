@@ -172,7 +172,7 @@ class FilterBank:
         weigh = partial(self._weigh, row)
         update = self.running.update(slopes * used[..., None], innovation, self.variance[row], weigh)
         self.average.learn(np.where(used, update.log_density, 0.0))
-        values = update.nis, update.believed, self.average.offset, self.average.drifting
+        values = update.nis, update.accepted, self.average.offset, self.average.drifting
         self.judged[:, row] = [self.average.mean(one) for one in values]
         return update
 
@@ -182,7 +182,7 @@ class FilterBank:
         if self.error_model is not None:
             used, pair, errors = self.uses[row][robust], self.pair[row], self.error_model.at(row)
             own = self.reflections.weigh(innovation_m[robust], variance_m2[robust], errors, pair, used)
-            for name in ("noise_m", "variance_m2", "believed", "tail", "log_density"):
+            for name in ("noise_m", "variance_m2", "accepted", "tail", "log_density"):
                 getattr(update, name)[robust] = getattr(own, name)
         return update
 

@@ -372,7 +372,7 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
             geometry = one.arm_m[number], one.anchor_m[number], one.sign[number]
             more = shared[number], one.patterns[number]
             update = running.update_range(measured, noise_m, one.errors.at(number), *geometry, *more)
-            updates.append((now, float(update.nis[best]), bool(update.believed[best]), running.drifts))
+            updates.append((now, float(update.nis[best]), bool(update.accepted[best]), running.drifts))
             # As in `tracking.run_filters`, but explained ranges do not extend the time before a restart: this filter
             # drifts.
             lasted_s = min(now - heard, settings.reopen_s / 2 / MIN_RANGES_PER_FIX)
@@ -458,7 +458,7 @@ def onboard_json(found: list[OnboardTrack]) -> list[dict[str, Any]]:
             "rmse_m": for_json(one.rmse_m),
             "std_m": float(np.sqrt(np.mean(one.std_m**2))),
             "nis": float(np.mean(one.nis)),
-            "believed": float(np.mean(one.accepted)),
+            "accepted": float(np.mean(one.accepted)),
             "restarts_s": list(one.restarts_s),
             **delays_json(one),
         }

@@ -330,7 +330,7 @@ def run_filters(problem: Problem, ranges: Mapping[str, FilterRanges], settings: 
         lasted_s = min(elapsed_s[k], most_s)
         # A body with two others, one of them behind an obstacle, has reflections in half of its ranges: no reason to
         # restart.
-        counts = np.where(update.nis < settings.gate, 1.0, np.where(update.believed, -0.5, -1.0))
+        counts = np.where(update.nis < settings.gate, 1.0, np.where(update.accepted, -0.5, -1.0))
         explained_s = np.minimum(explained_s + counts * lasted_s, PATIENCE_S)
         for lost in zip(*np.nonzero(explained_s < -settings.reopen_s / 2), strict=True):
             rows = slice(np.searchsorted(problem.time_ns, problem.time_ns[k] - settings.reopen_s * 1e9), k + 1)

@@ -25,7 +25,7 @@ from calib.estimator.covariates import (
     Covariate,
 )
 from calib.estimator.inverse import positive_part
-from calib.estimator.known_distances import KnownDistances, fit_known_distances
+from calib.estimator.known_distances import RangeFit, fit_known_distances
 from calib.estimator.optimize import Optimum
 from calib.estimator.range_model import OFFSETS
 from calib.estimator.score_tests import Derivative, Family, Tested
@@ -64,7 +64,7 @@ of the latter among `REMEDIES`."""
 
 def fit_with_covariates(
     ranges: Ranges, settings: FitSettings
-) -> tuple[KnownDistances, dict[str, dict[str, Any]], list[Finding]]:
+) -> tuple[RangeFit, dict[str, dict[str, Any]], list[Finding]]:
     """Return the fit with the dependences that `settings` ask for, what to remember of them by setting, and findings.
 
     Raises `UnanswerableError` where one is asked for that the data do not determine, and what `fit_known_distances`
@@ -85,9 +85,7 @@ def fit_with_covariates(
     return found, told, findings
 
 
-def _with(
-    name: str, asked: str, plain: KnownDistances, ranges: Ranges
-) -> tuple[KnownDistances, dict[str, Any], list[Finding]]:
+def _with(name: str, asked: str, plain: RangeFit, ranges: Ranges) -> tuple[RangeFit, dict[str, Any], list[Finding]]:
     """Return a fit with the dependence `name` beside those of a `plain` fit, if there is evidence or it is `asked`."""
     model, nothing = plain.model, (plain, dict[str, Any](), list[Finding]())
     covariate = COVARIATES[name][0](model.ranges)
@@ -169,7 +167,7 @@ def _not_fitted(name: str, covariate: Covariate, why: str) -> dict[str, Any]:
     return {"why": why} if name == "temperature" and covariate.tags else {}
 
 
-def _beside_power(plain: KnownDistances, covariate: Covariate, kind: str) -> Tested:
+def _beside_power(plain: RangeFit, covariate: Covariate, kind: str) -> Tested:
     """Return the slopes of a pattern beside offsets of each tag that go with the rank of power."""
     names, columns, values = covariate.entries(kind, plain.model.pairs)
     tags, pairs, count = plain.model.tags, plain.model.pairs, len(values)
@@ -221,7 +219,7 @@ def _log_marginal(optimum: Optimum) -> float:
     return optimum.value + 0.5 * weights - 0.5 * float(np.linalg.slogdet(known)[1])
 
 
-def _family(found: KnownDistances, covariate: Covariate, kind: str, *, fitted: bool = False) -> Family:
+def _family(found: RangeFit, covariate: Covariate, kind: str, *, fitted: bool = False) -> Family:
     """Return the unknowns of a kind as alternatives to a fit, or as the ones that are `fitted`."""
     names, columns, values = covariate.entries(kind, found.model.pairs)
     indices = found.searches[0].optimum.layout.indices([kind] if fitted else [])
@@ -280,7 +278,7 @@ def _why(name: str, covariate: Covariate, ranges: Ranges, needed: int) -> str:
     return f"{still}tags {first_few(map(str, covariate.tags or ranges.tags()))}: {what}"
 
 
-def drift_of(found: KnownDistances) -> dict[str, Any]:
+def drift_of(found: RangeFit) -> dict[str, Any]:
     """Return how fast what a tag adds to ranges drifts, for the provenance of a fit; {} where nothing can be said.
 
     Delays are random walks of one variance a day (`m2_per_day`: the likeliest, with its 95 % interval by the likelihood

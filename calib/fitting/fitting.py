@@ -22,18 +22,18 @@ from calib.calibration.model import Calibration, CalibrationSource, given_calibr
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import (
     dependence_on_initiator,
-    doubts_about_data,
+    differing_power_levels,
     implausible_values,
     limits,
+    limits_of_data,
     refuse_contradicted,
     refuse_impossible,
     refuse_refuted,
-    unlike_power_levels,
 )
 from calib.data.ranges import Ranges, held_out
 from calib.data.sources import Data, load_ranges, require_arrivals
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimator.known_distances import KnownDistances
+from calib.estimator.known_distances import RangeFit
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
@@ -121,7 +121,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     return replace(result, held_out=held)
 
 
-def _provenance(found: KnownDistances, ranges: Ranges, settings: FitSettings) -> dict[str, Any]:
+def _provenance(found: RangeFit, ranges: Ranges, settings: FitSettings) -> dict[str, Any]:
     """Return the provenance of a fit to known distances: data, recipe, gauge and drift."""
     return {
         **({} if found.model.reference_dbm is None else {"reference_power_dbm": found.model.reference_dbm}),
@@ -283,7 +283,7 @@ def _given_delays(known: Calibration | None, ranges: Ranges, *, curve: bool) -> 
 
 
 def result_of(
-    found: KnownDistances,
+    found: RangeFit,
     calibration: Calibration,
     ranges: Ranges,
     findings: Iterable[Finding],
@@ -317,9 +317,9 @@ def result_of(
         *more,
         *findings,
         *implausible_values(calibration.delays_ns, residuals),
-        *unlike_power_levels(ranges, calibration),
+        *differing_power_levels(ranges, calibration),
         *_without_reference_power(found),
-        *doubts_about_data(ranges, float(np.mean(inliers)), found.blocks.seconds),
+        *limits_of_data(ranges, float(np.mean(inliers)), found.blocks.seconds),
     ]
     provenance: dict[str, Any] = {
         "writer": f"uwbcal {uwblink.__version__}",
@@ -376,7 +376,7 @@ def _evaluate_held_out(held: HeldOut, settings: FitSettings) -> dict[str, Any]:
     return {name: for_json(value) for name, value in judged.items()}
 
 
-def _convergence(found: KnownDistances, asked_for: str | None) -> Iterator[Finding]:
+def _convergence(found: RangeFit, asked_for: str | None) -> Iterator[Finding]:
     if asked_for == MIXTURE and found.searches[0].loss != MIXTURE:
         text = "the likelihood treated all ranges of a pair as reflected, so a robust loss was fitted instead"
         yield warning("another loss", text)
@@ -385,7 +385,7 @@ def _convergence(found: KnownDistances, asked_for: str | None) -> Iterator[Findi
         yield warning("not converged", text)
 
 
-def _without_reference_power(found: KnownDistances) -> Iterator[Finding]:
+def _without_reference_power(found: RangeFit) -> Iterator[Finding]:
     """Yield a finding if no range has the reference power, so that delays are stated at the nearest power."""
     model, settings = found.model, found.model.settings
     if model.reference is None or not _has_gauge(found):
@@ -399,12 +399,12 @@ def _without_reference_power(found: KnownDistances) -> Iterator[Finding]:
         )
 
 
-def _has_gauge(found: KnownDistances) -> bool:
+def _has_gauge(found: RangeFit) -> bool:
     """Return whether delays can take over the constant of any curve."""
     return any(carrier is not None for carrier in found.model.carriers)
 
 
-def fitted_quantities(found: KnownDistances) -> str:
+def fitted_quantities(found: RangeFit) -> str:
     """Return the names of the fitted quantities."""
     model = found.model
     if model.settings.constants == "pair":
@@ -414,7 +414,7 @@ def fitted_quantities(found: KnownDistances) -> str:
     return "curve only" if model.pinned else "delays and curve"
 
 
-def _gauge(found: KnownDistances) -> str:
+def _gauge(found: RangeFit) -> str:
     """Return a sentence on the choice of the common constant of delays and curve."""
     carrier = "constants of pairs" if found.model.settings.constants == "pair" else "delays"
     if found.model.curve is None:

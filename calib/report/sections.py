@@ -119,7 +119,7 @@ def _foundations(results: Results) -> list[Block]:
     summary = known_facts(provenance)
     if not summary:
         return []
-    facts, off = provenance["rests_on"], provenance.get("distance_std_m")
+    facts, off = provenance["geometry"], provenance.get("distance_std_m")
 
     def names(key: str) -> str:
         return ", ".join(map(str, facts.get(key) or [])) or "none"
@@ -133,7 +133,7 @@ def _foundations(results: Results) -> list[Block]:
         ["measured distances", str(facts.get("distances", 0))],
         ["heights of", names("heights")],
         ["standard error of estimated distances", f"{100 * off:.1f} cm" if isinstance(off, int | float) else ""],
-        ["undetermined", str(provenance.get("left_open", ""))],
+        ["undetermined", str(provenance.get("undetermined_text", ""))],
     ]
     return [
         Heading("Known facts"),
@@ -146,19 +146,19 @@ def _of_survey(made: Any) -> list[Block]:
     def counted(count: int, what: str) -> str:
         return f"{count or 'no'} {what}{'s' * (count != 1)}"
 
-    rests = made["rests_on"]
+    geometry = made["geometry"]
     beside = [
-        counted(int(rests.get("known_distances", 0)), "known distance"),
-        counted(int(rests.get("known_positions", 0)), "known position"),
+        counted(int(geometry.get("known_distances", 0)), "known distance"),
+        counted(int(geometry.get("known_positions", 0)), "known position"),
         counted(len(made.get("fixed_ns", {})), "known delay"),
     ]
     blocks: list[Block] = [
         Text(
             f"No true distance was known. {counted(int(made['pairs']), 'mean range')} of pairs in "
-            f"{counted(len(rests['arrangements']), 'arrangement')} of boards that stood still determine positions "
+            f"{counted(len(geometry['arrangements']), 'arrangement')} of boards that stood still determine positions "
             f"and delays, together with {', '.join(beside)}. A pair has a constant error of "
-            f"{100 * float(rests['pair_error_m']):.1f} "
-            f"cm in an arrangement; {float(rests['freedom']):.0f} degrees of freedom are left."
+            f"{100 * float(geometry['pair_error_m']):.1f} "
+            f"cm in an arrangement; {float(geometry['freedom']):.0f} degrees of freedom are left."
         )
     ]
     surveyed = [SurveyedArrangement.from_dict(row) for row in made.get("surveyed", [])]

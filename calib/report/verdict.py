@@ -217,10 +217,10 @@ def _settled(results: Results) -> Criterion:
 def undetermined_delays(results: Results) -> str:
     """Return a text on the delays that the pairs do not determine, "" without any."""
     made, splits = results.calibration.provenance, results.calibration.undetermined_splits
-    if splits and "left_open" not in made:
+    if splits and "undetermined_text" not in made:
         return split_text(splits)
     groups = "; ".join(", ".join(map(str, group)) for group in made.get("undetermined", []))
-    return str(made.get("left_open", f"the delays of tags {groups} are not determined" if groups else ""))
+    return str(made.get("undetermined_text", f"the delays of tags {groups} are not determined" if groups else ""))
 
 
 def _warned(results: Results) -> Criterion:
@@ -237,7 +237,7 @@ def _warned(results: Results) -> Criterion:
 def _of_survey(results: Results) -> Iterator[Criterion]:
     """Yield the criteria for surveys of boards that stand still."""
     made = results.calibration.provenance
-    rests, pairs = made["rests_on"], int(made["pairs"])
+    geometry, pairs = made["geometry"], int(made["pairs"])
     against = contradictions_in(made)
     yield Criterion(
         "Do the ranges agree with the known facts?",
@@ -249,7 +249,7 @@ def _of_survey(results: Results) -> Iterator[Criterion]:
         else "nothing contradicts",
     )
     # With few degrees of freedom, wrong ranges are not detected, and the spread of errors is hardly determined.
-    freedom, least = float(rests["freedom"]), 10.0
+    freedom, least = float(geometry["freedom"]), 10.0
     yield Criterion(
         "Do the arrangements check each other?",
         f"at least {least:g} more mean ranges of pairs than unknowns",
@@ -257,7 +257,7 @@ def _of_survey(results: Results) -> Iterator[Criterion]:
         _graded(freedom >= least, freedom >= 4.0),
         f"{freedom:.0f} of {pairs} mean ranges of pairs are redundant",
     )
-    error, most_m = float(rests["pair_error_m"]), 0.03
+    error, most_m = float(geometry["pair_error_m"]), 0.03
     yield Criterion(
         "Are the constant errors of pairs small enough?",
         f"at most {100 * most_m:g} cm, without reflections",

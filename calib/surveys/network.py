@@ -30,7 +30,7 @@ DIMENSIONS = {"line": 1, "plane": 2, "": 3}
 """The number of dimensions of an arrangement, by its known shape."""
 
 
-EXTRA_M, EXTRA_STD_M = 0.3, 0.25
+DETOUR_MEAN_M, DETOUR_STD_M = 0.3, 0.25
 """Prior mean and standard deviation of the detour of a reflected path (published detours are 0.1 to 0.5 m). Half or
 twice of either moves delays beside reflections by 0.28 standard errors (`python -m benchmarks.constants`)."""
 
@@ -154,7 +154,7 @@ class Linear:
         """The step (p,) to the likeliest unknowns."""
         return np.asarray(self.covariance @ self.slope)
 
-    def unlikely(self) -> float:
+    def deviance(self) -> float:
         """Return -2 log likelihood of the rows, integrated over the unknowns (Laplace's approximation)."""
         own = np.ix_(self._free, self._free)
         value = float(self.left @ self.left) + self._prior_value - float(self.slope @ self.step)
@@ -207,7 +207,7 @@ class Network:
         """The arrangement of every point (points,)."""
         return np.array([k for k, _ in self.points])
 
-    def holding(self, known: KnownDistance | KnownPosition) -> list[int]:
+    def arrangements_with(self, known: KnownDistance | KnownPosition) -> list[int]:
         """Return the arrangements in which a distance or a position is valid."""
         who = {known.first, known.second} if isinstance(known, KnownDistance) else {known.tag}
         return [
@@ -224,7 +224,7 @@ class Network:
         """
         ends, rows = [], []
         for number, one in enumerate(self.distances):
-            where = self.holding(one)
+            where = self.arrangements_with(one)
             ends += [(self.points[k, one.first], self.points[k, one.second]) for k in where]
             rows += [(one.distance_m, one.sigma_m * math.sqrt(len(where)), number)] * len(where)
         return np.array(ends, dtype=np.int64).reshape(-1, 2), np.array(rows).reshape(-1, 3)
@@ -234,7 +234,7 @@ class Network:
         """Known positions (3,) and their standard deviations by point; on a plane x and y count."""
         found = {}
         for one in self.positions:
-            for k in (where := self.holding(one)):
+            for k in (where := self.arrangements_with(one)):
                 place = np.where(np.arange(3) < self.arrangements[k].dimensions, one.position_m, 0.0)
                 found[self.points[k, one.tag]] = (place, one.sigma_m * math.sqrt(len(where)))
         return found
@@ -284,7 +284,7 @@ class Network:
         delays = [k for k, tag in enumerate(self.tags, start=3 * len(self.points)) if tag not in self.fixed_ns]
         return np.array([*places, *delays], dtype=np.int64)
 
-    def seats(self, arrangement: int) -> Ints:
+    def members(self, arrangement: int) -> Ints:
         """Return the points (rows of `points`) of an arrangement, in the order of its tags."""
         return np.flatnonzero(self.owner == arrangement)
 
@@ -292,12 +292,12 @@ class Network:
         """Return the points (points, 3) of a vector of unknowns."""
         return x[self.layout.where["place"]].reshape(-1, 3).copy()
 
-    def with_positions(self, x: Floats, positions: Floats, seats: Ints | slice = slice(None)) -> Floats:
-        """Return a vector of unknowns with other points (points, 3), or other points of some `seats`, if
+    def with_positions(self, x: Floats, positions: Floats, members: Ints | slice = slice(None)) -> Floats:
+        """Return a vector of unknowns with other points (points, 3), or other points of some `members`, if
         they are free.
         """
         place, found, free = self.positions_m(x), x.copy(), self.layout.free()
-        place[seats] = positions
+        place[members] = positions
         mine = free[free < place.size]
         found[mine] = place.ravel()[mine]
         return found
@@ -328,7 +328,7 @@ class Network:
         place, found = self.positions_m(x), self._of_delays_and_curve.copy()
         apart = place[self.ends[:, 0]] - place[self.ends[:, 1]]
         length = np.linalg.norm(apart, axis=1)
-        measured = np.concatenate([self.means.range_m - EXTRA_M * marks, self.tapes[1][:, 0]])
+        measured = np.concatenate([self.means.range_m - DETOUR_MEAN_M * marks, self.tapes[1][:, 0]])
         left = measured - length - found @ x
         # Boards at the same place have no direction: any direction separates them.
         unit = np.where(length[:, None] > 1e-9, apart / np.maximum(length, 1e-9)[:, None], [1.0, 0.0, 0.0])
@@ -338,7 +338,7 @@ class Network:
 
     def std_m(self, case: Case) -> Floats:
         """Return the standard deviation of each row, with the constant errors of pairs."""
-        means = np.sqrt(self.means.std_m**2 + case.pair_m**2 + EXTRA_STD_M**2 * case.marks)
+        means = np.sqrt(self.means.std_m**2 + case.pair_m**2 + DETOUR_STD_M**2 * case.marks)
         return np.concatenate([means, self.tapes[1][:, 1]])
 
     @cached_property
@@ -355,5 +355,5 @@ class Network:
         """Return the network of the means of one arrangement, with only its places as unknowns."""
         rows, unknowns = self.means.arrangement == arrangement, np.arange(self.layout.size)
         curve = None if self.curve is None else replace(self.curve, design=self.curve.design[rows])
-        own = np.isin(unknowns // 3, self.seats(arrangement)) & np.isin(unknowns, self.layout.free())
+        own = np.isin(unknowns // 3, self.members(arrangement)) & np.isin(unknowns, self.layout.free())
         return replace(self, means=self.means[rows], curve=curve, held=tuple(unknowns[~own].tolist()))

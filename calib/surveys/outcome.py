@@ -167,7 +167,7 @@ def _calibration(
         "exchanges": int(network.means.count.sum()),
         "pairs": len(network.means.range_m),
         "recipe": "survey",
-        "rests_on": {
+        "geometry": {
             "arrangements": [
                 {"name": boards.name, "known": boards.shape, "tags": list(boards.tags)}
                 for boards in network.arrangements
@@ -214,11 +214,11 @@ def in_frames(found: Solution) -> Solution:
     network, x, held = found.network, found.x.copy(), list[int]()
     place = x[network.layout.where["place"]].reshape(-1, 3)
     for k, boards in enumerate(network.arrangements):
-        seats = network.seats(k)
-        if not network.known_places.keys() & set(seats.tolist()):
-            turn, own, _ = _frame(place[seats], boards)
-            place[seats] = (place[seats] - place[seats[0]]) @ turn.T
-            held += [3 * int(seats[0]) + n for n in own]
+        members = network.members(k)
+        if not network.known_places.keys() & set(members.tolist()):
+            turn, own, _ = _frame(place[members], boards)
+            place[members] = (place[members] - place[members[0]]) @ turn.T
+            held += [3 * int(members[0]) + n for n in own]
     x[held] = 0.0
     return replace(found, network=replace(network, held=tuple(held)), x=x)
 
@@ -246,13 +246,13 @@ def _frame(points: Floats, boards: Boards) -> tuple[Floats, list[int], str]:
 
 def _arrangement(found: Solution, number: int) -> SurveyedArrangement:
     """Return the places of boards in an arrangement, in the frame of known positions or of its first boards."""
-    network, boards, seats = found.network, found.network.arrangements[number], found.network.seats(number)
+    network, boards, members = found.network, found.network.arrangements[number], found.network.members(number)
     points, covariance = network.positions_m(found.x), found.covariance() * interval_factor(found.freedom) ** 2
-    own = [slice(3 * seat, 3 * seat + 3) for seat in seats.tolist()]
+    own = [slice(3 * member, 3 * member + 3) for member in members.tolist()]
     surveyed = tuple(
         SurveyedBoard(tag, (x, y, z), covariance[one, one], bool(np.trace(covariance[one, one]) < 1.0))
-        for tag, one, (x, y, z) in zip(boards.tags, own, points[seats].tolist(), strict=True)
+        for tag, one, (x, y, z) in zip(boards.tags, own, points[members].tolist(), strict=True)
     )
-    known = network.known_places.keys() & set(seats.tolist())
-    frame = "that of the known positions" if known else _frame(points[seats], boards)[2]
+    known = network.known_places.keys() & set(members.tolist())
+    frame = "that of the known positions" if known else _frame(points[members], boards)[2]
     return SurveyedArrangement(boards.name, boards.shape, surveyed, frame)

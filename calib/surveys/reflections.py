@@ -19,10 +19,10 @@ from functools import cached_property
 import numpy as np
 from scipy.special import betaln, ndtr
 
-from calib.surveys.network import EXTRA_M, EXTRA_STD_M, Case, Linear, Network
+from calib.surveys.network import DETOUR_MEAN_M, DETOUR_STD_M, Case, Linear, Network
 from uwblink.arrays import Bools, Floats
 
-REFLECTED, STRAIGHT = 1.0, 30.0
+PRIOR_REFLECTED, PRIOR_DIRECT = 1.0, 30.0
 """Number of rows with and without a detour that the prior of their share counts for: 3 % are reflected. Half or twice
 of either moves delays by 0.2 standard errors (`python -m benchmarks.constants`)."""
 
@@ -64,22 +64,22 @@ class Marks:
     def penalties(self) -> Floats:
         """Return -2 log of the probability that the detour of each row (n,) is positive, if it is marked."""
         own = np.diag(self.inverse)
-        grown = np.where(self.marked, 1.0, 1 + EXTRA_STD_M**2 * own)
-        own, pull = own / grown, (self.pull - np.where(self.marked, 0.0, EXTRA_M) * own) / grown
-        mean, variance = EXTRA_M + EXTRA_STD_M**2 * pull, EXTRA_STD_M**2 - EXTRA_STD_M**4 * own
+        grown = np.where(self.marked, 1.0, 1 + DETOUR_STD_M**2 * own)
+        own, pull = own / grown, (self.pull - np.where(self.marked, 0.0, DETOUR_MEAN_M) * own) / grown
+        mean, variance = DETOUR_MEAN_M + DETOUR_STD_M**2 * pull, DETOUR_STD_M**2 - DETOUR_STD_M**4 * own
         longer = ndtr(mean / np.sqrt(np.maximum(variance, 1e-12)))
-        return np.asarray(-2 * np.log((longer + SHORTER_SHARE) / (ndtr(EXTRA_M / EXTRA_STD_M) + SHORTER_SHARE)))
+        return np.asarray(-2 * np.log((longer + SHORTER_SHARE) / (ndtr(DETOUR_MEAN_M / DETOUR_STD_M) + SHORTER_SHARE)))
 
     @cached_property
     def plain_changes(self) -> Floats:
         """What a change of each mark (n,) adds to -2 log likelihood, without penalties."""
         sign, own = self.sign, np.diag(self.inverse)
-        grown = np.maximum(1 + sign * EXTRA_STD_M**2 * own, 1e-12)
-        away = self.pull - sign * EXTRA_M * own
-        found = np.log(grown) - 2 * sign * EXTRA_M * self.pull + EXTRA_M**2 * own
-        found -= sign * EXTRA_STD_M**2 * away**2 / grown
+        grown = np.maximum(1 + sign * DETOUR_STD_M**2 * own, 1e-12)
+        away = self.pull - sign * DETOUR_MEAN_M * own
+        found = np.log(grown) - 2 * sign * DETOUR_MEAN_M * self.pull + DETOUR_MEAN_M**2 * own
+        found -= sign * DETOUR_STD_M**2 * away**2 / grown
         count, rows = int(self.marked.sum()), len(self.marked)
-        share = np.array([unlikely(min(max(count + step, 0), rows), rows) for step in (-1, 0, 1)])
+        share = np.array([deviance_of_count(min(max(count + step, 0), rows), rows) for step in (-1, 0, 1)])
         return np.asarray(found + share[1 + sign.astype(int)] - share[1])
 
     def changes(self) -> Floats:
@@ -89,8 +89,8 @@ class Marks:
     def with_change(self, row: int) -> Marks:
         """Return these marks with the mark of one row changed (by the formula of Sherman and Morrison)."""
         sign, column = self.sign[row], self.inverse[:, row]
-        pull = self.pull - sign * EXTRA_M * column
-        gain = sign * EXTRA_STD_M**2 / (1 + sign * EXTRA_STD_M**2 * column[row])
+        pull = self.pull - sign * DETOUR_MEAN_M * column
+        gain = sign * DETOUR_STD_M**2 / (1 + sign * DETOUR_STD_M**2 * column[row])
         return Marks(
             np.where(np.arange(len(column)) == row, ~self.marked, self.marked),
             self.inverse - gain * np.outer(column, column),
@@ -134,8 +134,10 @@ class Marks:
         return [one.marked for one in kept], weight / weight.sum()
 
 
-def unlikely(count: int, rows: int) -> float:
+def deviance_of_count(count: int, rows: int) -> float:
     """Return -2 log of the probability that exactly these rows are reflected, `count` of them, integrated over the
     share.
     """
-    return -2 * float(betaln(REFLECTED + count, STRAIGHT + rows - count) - betaln(REFLECTED, STRAIGHT))
+    return -2 * float(
+        betaln(PRIOR_REFLECTED + count, PRIOR_DIRECT + rows - count) - betaln(PRIOR_REFLECTED, PRIOR_DIRECT)
+    )

@@ -27,11 +27,11 @@ from calib.estimator.inverse import positive_part
 from calib.estimator.optimize import maximize
 from calib.estimator.scaling import scaled_places
 from calib.surveys.network import Boards, Case, Lengths, Linear, Network
-from calib.surveys.reflections import Marks, unlikely
+from calib.surveys.reflections import Marks, deviance_of_count
 from calib.surveys.result import SecondBest
 from uwblink.arrays import Bools, Floats, Ints
 
-SHAKEN = 4
+RANDOM_STARTS = 4
 """Random starts of an arrangement beside those that are mirrored or exchanged: half or twice as many change nothing
 (`python -m benchmarks.constants`)."""
 
@@ -67,7 +67,7 @@ def first_start(network: Network, delays: Floats | None = None) -> Floats:
     place = np.zeros((len(network.points), 3))
     measured = network.linear(np.where(np.arange(len(x)) < place.size, 0.0, x))[0]  # with all points at the origin
     for k, boards in enumerate(network.arrangements):
-        here = network.seats(k)
+        here = network.members(k)
         rows = np.flatnonzero(np.isin(network.ends[: len(network.means.range_m), 0], here))
         ends, length = np.searchsorted(here, network.ends[rows]), np.maximum(measured[rows], 0.01)
         # The derivative by a coordinate that is zero for all boards would be zero.
@@ -100,7 +100,7 @@ def other_starts(points: Floats, boards: Boards, seed: int) -> Iterator[Floats]:
         normal = axes[boards.dimensions - 1]
         yield points - 2 * np.outer(middle @ normal, normal)
     rng, spread = np.random.default_rng(seed), max(float(size[0]) / np.sqrt(len(points)), 0.1)
-    for _ in range(SHAKEN):
+    for _ in range(RANDOM_STARTS):
         yield points + 0.5 * spread * rng.normal(size=points.shape)
 
 
@@ -129,7 +129,7 @@ it: half or twice of it does not change results (`python -m benchmarks.constants
 class Solution:
     """The best unknowns `x` (p,) of a network, and their errors.
 
-    `unlikely` is -2 log of the total likelihood, up to a constant that all solutions of one set of means share.
+    `deviance` is -2 log of the total likelihood, up to a constant that all solutions of one set of means share.
     `chance` (n,) is the probability of each mean of being reflected, and `more` (p, p) the covariance that is added
     because other means may be reflected, or spreads may differ.
     """
@@ -137,7 +137,7 @@ class Solution:
     network: Network
     x: Floats
     case: Case
-    unlikely: float
+    deviance: float
     settled: bool
     chance: Floats
     more: Floats
@@ -186,12 +186,12 @@ def of_spreads(network: Network, x: Floats, case: Case) -> float:
     """Return -2 log likelihood near an optimum, integrated over the unknowns, with the prior density of the spreads."""
     pairs = PAIR_PRIOR_FREEDOM * (2 * math.log(case.pair_m) + (PAIR_STD_M / case.pair_m) ** 2)
     curve = (math.log(case.curve_m / CURVE_STD_M) / math.log(CURVE_FACTOR)) ** 2
-    return Linear(network, x, case).unlikely() + pairs + curve
+    return Linear(network, x, case).deviance() + pairs + curve
 
 
-def unlikelihood(network: Network, x: Floats, case: Case) -> float:
+def total_deviance(network: Network, x: Floats, case: Case) -> float:
     """Return the same plus -2 log probability of the reflections and of the order of the boards."""
-    value = of_spreads(network, x, case) + unlikely(int(case.marks.sum()), len(case.marks))
+    value = of_spreads(network, x, case) + deviance_of_count(int(case.marks.sum()), len(case.marks))
     if case.marks.any():
         value += float(Marks.at(network, x, case).penalties()[case.marks].sum())
     # One stated order in a hundred is wrong.
@@ -238,7 +238,7 @@ def adjust(network: Network, x: Floats, *, marks: Bools | None = None, start_m: 
         network=network,
         x=x,
         case=case,
-        unlikely=unlikelihood(network, x, case),
+        deviance=total_deviance(network, x, case),
         settled=settled,
         chance=case.marks.astype(float),
         more=np.zeros((len(x),) * 2),
@@ -294,7 +294,7 @@ def _average_cases(found: Solution, cases: Sequence[Case], weight: Floats) -> tu
 
 def solve(network: Network) -> tuple[Solution, SecondBest | None]:
     """Return the best solution from all starts, and the second-best."""
-    start, least = first_start(network), attrgetter("unlikely")
+    start, least = first_start(network), attrgetter("deviance")
     # With small errors of pairs too many means seem reflected at first, with large ones too few.
     spreads = (0.01, 0.015, 0.02, 0.03, 0.045, 0.07) if network.pair_m is None else (network.pair_m,)
     found = min((adjust(network, start, start_m=spread) for spread in spreads), key=least)
@@ -303,7 +303,7 @@ def solve(network: Network) -> tuple[Solution, SecondBest | None]:
     worse: list[SecondBest] = []
     # At most six moves to another solution.
     for _ in range(6):
-        here = unlikelihood(network, found.x, found.case)
+        here = total_deviance(network, found.x, found.case)
         others = [other for k in range(len(network.arrangements)) for other in _other_solutions(found, k)]
         # Rounded, so that every machine chooses the same one of mirror images.
         worse = [
@@ -311,7 +311,7 @@ def solve(network: Network) -> tuple[Solution, SecondBest | None]:
         ]
         value, x, case, _ = min(others, key=itemgetter(0), default=(here, found.x, found.case, None))
         moved = adjust(network, x, marks=case.marks) if value < here - 1e-3 else found
-        if moved.unlikely > found.unlikely - 1e-3:
+        if moved.deviance > found.deviance - 1e-3:
             break
         found = moved
     return found, min(worse, key=attrgetter("worse", "arrangement", "tags"), default=None)
@@ -321,32 +321,33 @@ def _other_solutions(
     found: Solution, arrangement: int
 ) -> Iterator[tuple[float, Floats, Case, tuple[str, tuple[int, ...]]]]:
     """Yield other solutions that differ in one arrangement: likelihood, unknowns, errors, and the displaced boards."""
-    network, boards, seats = found.network, found.network.arrangements[arrangement], found.network.seats(arrangement)
+    network = found.network
+    boards, members = network.arrangements[arrangement], network.members(arrangement)
     alone, mine = network.alone(arrangement), network.means.arrangement == arrangement
     case = replace(found.case, marks=found.case.marks[mine])
     # A solution counts as another one if a board moves by 3 cm.
     least_m = 0.03
-    most, seen = unlikelihood(alone, found.x, case) + MAX_WORSE_ALONE, [_signature(network, found.x, seats)]
-    for points in other_starts(network.positions_m(found.x)[seats], boards, seed=arrangement):
-        start = network.with_positions(found.x, points, seats)
+    most, seen = total_deviance(alone, found.x, case) + MAX_WORSE_ALONE, [_signature(network, found.x, members)]
+    for points in other_starts(network.positions_m(found.x)[members], boards, seed=arrangement):
+        start = network.with_positions(found.x, points, members)
         x, own = find_reflected_means(alone, start, replace(case, marks=np.zeros_like(case.marks)))
-        mark = _signature(network, x, seats)
-        if unlikelihood(alone, x, own) > most or any(np.abs(mark - one).max() < least_m for one in seen):
+        mark = _signature(network, x, members)
+        if total_deviance(alone, x, own) > most or any(np.abs(mark - one).max() < least_m for one in seen):
             continue
         seen.append(mark)
         marks = found.case.marks.copy()
         marks[mine] = own.marks
         x, whole = find_reflected_means(network, x, replace(found.case, marks=marks))
-        change = np.abs(_signature(network, x, seats) - seen[0]).max(axis=1)
+        change = np.abs(_signature(network, x, members) - seen[0]).max(axis=1)
         if change.max() >= least_m:
             tags = np.array(boards.tags)[change > max(least_m, 0.5 * change.max())]
-            yield unlikelihood(network, x, whole), x, whole, (boards.name, tuple(tags.tolist()))
+            yield total_deviance(network, x, whole), x, whole, (boards.name, tuple(tags.tolist()))
 
 
-def _signature(network: Network, x: Floats, seats: Ints) -> Floats:
+def _signature(network: Network, x: Floats, members: Ints) -> Floats:
     """Return the features (points, k) that distinguish solutions of an arrangement: distances, and places if a frame is
     known.
     """
-    place = network.positions_m(x)[seats]
+    place = network.positions_m(x)[members]
     apart = np.linalg.norm(place[:, None] - place, axis=2)
-    return np.hstack([apart, place]) if network.known_places.keys() & set(seats.tolist()) else apart
+    return np.hstack([apart, place]) if network.known_places.keys() & set(members.tolist()) else apart

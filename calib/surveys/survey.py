@@ -43,14 +43,14 @@ from uwblink.ticks import SPEED_OF_LIGHT
 def likeliest_fault(found: Solution) -> tuple[Finding, Solution] | None:
     """Return the likeliest fault that chance does not explain, and the solution without it."""
     tried = [
-        (fault, text, without, math.exp(min(0.5 * (without.unlikely - found.unlikely), 0.0)))
+        (fault, text, without, math.exp(min(0.5 * (without.deviance - found.deviance), 0.0)))
         for fault, hypotheses in HYPOTHESES.items()
         for text, without in hypotheses(found)
     ]
     likely = [one for one in tried if one[3] < BUDGET]
     if not likely:
         return None
-    fault, text, without, p_value = min(likely, key=lambda one: one[2].unlikely)
+    fault, text, without, p_value = min(likely, key=lambda one: one[2].deviance)
     return warning(fault, text, p_value), without
 
 
@@ -80,14 +80,14 @@ def _shapes(found: Solution) -> Iterator[tuple[str, Solution]]:
         arrangements = list(network.arrangements)
         arrangements[k] = replace(boards, dimensions=boards.dimensions + 1, freed=True)
         freed = replace(network, arrangements=tuple(arrangements))
-        seats, beside = network.seats(k), boards.dimensions
-        place = freed.positions_m(first_start(freed, found.delays))[seats]
+        members, beside = network.members(k), boards.dimensions
+        place = freed.positions_m(first_start(freed, found.delays))[members]
         # If scaling puts all boards on the line, the derivative beside it would be zero: boards start 15 cm beside it.
         if np.ptp(place[:, beside]) < 0.15:
-            place[:, beside] += np.where(np.arange(len(seats)) % 2, 0.15, -0.15)
+            place[:, beside] += np.where(np.arange(len(members)) % 2, 0.15, -0.15)
         marks = found.case.marks & (network.means.arrangement != k)
-        without = adjust(freed, freed.with_positions(found.x, place, seats), marks=marks, start_m=found.case.pair_m)
-        away = freed.positions_m(without.x)[seats, beside]
+        without = adjust(freed, freed.with_positions(found.x, place, members), marks=marks, start_m=found.case.pair_m)
+        away = freed.positions_m(without.x)[members, beside]
         odd = boards.tags[int(np.argmax(np.abs(away - np.median(away))))]
         text = (
             f"{boards.name}: the boards are not on a {'line' if beside == 1 else 'plane'}: board {odd} is farthest "
@@ -125,7 +125,7 @@ def _exchanged(found: Solution) -> Iterator[tuple[str, Solution]]:
 
 HYPOTHESES = {
     "wrong known distance": _distances,
-    "arrangement not as it is said to be": _shapes,
+    "arrangement not as stated": _shapes,
     "exchanged labels": _exchanged,
 }
 """The hypotheses by fault."""
@@ -139,10 +139,10 @@ def wrong_orders(found: Solution) -> Iterator[Finding]:
     network, points = found.network, found.network.positions_m(found.x)
     spots, chances, covariance = {}, {}, found.covariance()
     for k in out_of_order(network, found.x):
-        seats = np.array([network.points[k, tag] for tag in network.arrangements[k].order])
-        along = points[seats, 0]
+        members = np.array([network.points[k, tag] for tag in network.arrangements[k].order])
+        along = points[members, 0]
         spots[k] = along if np.corrcoef(np.arange(len(along)), along)[0, 1] > 0 else -along
-        chances[k] = _chance_of_order(spots[k], covariance[np.ix_(3 * seats, 3 * seats)])
+        chances[k] = _chance_of_order(spots[k], covariance[np.ix_(3 * members, 3 * members)])
     pairs = {k: exchanged_boards(network.arrangements[k].order, along) for k, along in spots.items()}
     while pairs:
         common = Counter(pair for some in pairs.values() for pair in sorted(some))

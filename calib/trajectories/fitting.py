@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
-from scipy import sparse, special
+from scipy import sparse
 from threadpoolctl import threadpool_limits
 
 from calib.calibration.document import Split, reading_provenance
@@ -19,14 +19,14 @@ from calib.checks.limits import refuse_refuted
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.inverse import Matrix, inverse_of
-from calib.estimator.known_distances import Fitted, KnownDistances, model_of, with_covariances
+from calib.estimator.known_distances import Fitted, RangeFit, model_of, with_covariances
 from calib.estimator.losses import MIXTURE
 from calib.estimator.range_model import BOARD_DELAY_STD_NS, METRES_A_NS, RangeModel
 from calib.estimator.rows import sum_rows
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
 from calib.estimator.unknowns import Layout
-from calib.findings import Finding, warning
+from calib.findings import FIT_LEVELS, Finding, exceeds, warning
 from calib.fitting.fitting import fitted_quantities, result_of
 from calib.fitting.result import FitResult
 from calib.information import LOOSEST, InformationColumn, Verdict, judge
@@ -135,7 +135,7 @@ def range_model(scene: Scene, settings: FitSettings, *, curve: bool, offsets: bo
     return model, scene.only(model.ranges.truth_m.astype(np.int64))
 
 
-def _fit_to_estimated_distances(model: RangeModel, top: Search, known: Calibration | None) -> KnownDistances:
+def _fit_to_estimated_distances(model: RangeModel, top: Search, known: Calibration | None) -> RangeFit:
     """Return the result as a fit to the estimated distances; its covariance includes their uncertainty."""
     distances = top.geometry.distances(top.optimum.x)[0]
     model = replace(model, ranges=replace(model.ranges, truth_m=distances))
@@ -158,7 +158,7 @@ def _fit_to_estimated_distances(model: RangeModel, top: Search, known: Calibrati
     return found
 
 
-def _curve_uncertainty(found: KnownDistances, known: Calibration) -> Floats:
+def _curve_uncertainty(found: RangeFit, known: Calibration) -> Floats:
     """Return the covariance (tags, tags) in ns^2 that the uncertainty of a kept curve adds to the delays."""
     splines = basis(np.clip(found.model.lifted, *known.bias_curve.range), np.array(known.bias_curve.knots))
     # Derivatives of the unknowns by the coefficients: covariance times information.
@@ -168,7 +168,7 @@ def _curve_uncertainty(found: KnownDistances, known: Calibration) -> Floats:
 
 
 def _result(
-    found: KnownDistances,
+    found: RangeFit,
     top: Search,
     flight: FlightSettings,
     settings: FitSettings,
@@ -183,18 +183,18 @@ def _result(
     own, verdict = _judge_delays(found, top)
     # Splits that the pairs do not determine are fixed, so the covariance is zero along them.
     free = [int(tag) for tag in verdict.named("delay") if tag]
-    left_open = _undetermined_text(free, [model.tags[k] for k in own], covariance[np.ix_(own, own)], model.free)
+    undetermined = _undetermined_text(free, [model.tags[k] for k in own], covariance[np.ix_(own, own)], model.free)
     if free and len(free) == len(own) and not flight.minimum_norm:
         raise UnanswerableError(
-            f"{scene.source}: {left_open}; use known positions for some seconds (`poses_until_s`), give positions of "
-            f"anchors, or a known delay (`fixed_ns`); `minimum_norm` fits nevertheless, with a warning",
+            f"{scene.source}: {undetermined}; use known positions for some seconds (`poses_until_s`), give positions "
+            f"of anchors, or a known delay (`fixed_ns`); `minimum_norm` fits nevertheless, with a warning",
             undetermined=[free],
         )
     calibration = calibration_of(found, covariance)
     if known is not None:
         calibration = _with_curve(calibration, known)
     provenance = _provenance(found, top, flight) | {"distance_std_m": _distance_std_m(top)}
-    provenance |= {"undetermined": [free], "left_open": left_open} if free else {}
+    provenance |= {"undetermined": [free], "undetermined_text": undetermined} if free else {}
     calibration = replace(
         calibration,
         delays_std_ns=calibration.delays_std_ns | dict.fromkeys(free, math.inf),
@@ -202,7 +202,7 @@ def _result(
     )
     unsettled = f"the fit stopped after {top.steps} steps before it converged: delays are not final"
     limits = [
-        ("undetermined delays", left_open),
+        ("undetermined delays", undetermined),
         ("not converged", "" if top.optimum.success else unsettled),
         ("second solution", rival),
         *(("unused known distance", text) for text in scene.tapes.left_out),
@@ -226,7 +226,7 @@ def _with_curve(calibration: Calibration, known: Calibration) -> Calibration:
     return replace(calibration, bias_curve=known.bias_curve, uncertainty=uncertainty)
 
 
-def _provenance(found: KnownDistances, top: Search, flight: FlightSettings) -> dict[str, Any]:
+def _provenance(found: RangeFit, top: Search, flight: FlightSettings) -> dict[str, Any]:
     """Return the provenance that only fits of trajectories have."""
     scene, places_s, reference_dbm = top.motion.scene, top.motion.scene.places.time_s, found.model.reference_dbm
     return {
@@ -234,7 +234,7 @@ def _provenance(found: KnownDistances, top: Search, flight: FlightSettings) -> d
         "recipe": "trajectories",
         "truth": "ranges",
         "fitted": fitted_quantities(found),
-        "rests_on": {
+        "geometry": {
             "known_s": float(np.ptp(places_s)) if len(places_s) else 0.0,
             "moving": list(scene.moving),
             "anchors_given": [body for body, place in scene.still.items() if place is not None],
@@ -259,7 +259,7 @@ def variance_factor(scene: Scene) -> float:
     return 1.0 if given >= 2 or measured else 9.0
 
 
-def _judge_delays(found: KnownDistances, top: Search) -> tuple[Ints, Verdict]:
+def _judge_delays(found: RangeFit, top: Search) -> tuple[Ints, Verdict]:
     """Return the numbers of the delays that are not pinned (k,), and the verdict on them."""
     layout, optimum = top.optimum.layout, top.optimum
     unpinned = np.intersect1d(layout.indices(["delay"]), layout.free())
@@ -350,7 +350,7 @@ def _of_motion(top: Search) -> Iterator[Finding]:
 def _of_tapes(top: Search) -> Iterator[Finding]:
     """Yield a finding for each tape that the ranges contradict, by deleted residuals (Cook and Weisberg 1982).
 
-    These are beyond four standard errors and three centimetres.
+    Smaller ones than three centimetres are no finding.
     """
     rows, x = top.known.get("tape"), top.optimum.x
     if not isinstance(rows, TapeRows):
@@ -365,12 +365,13 @@ def _of_tapes(top: Search) -> Iterator[Finding]:
             continue
         free = 1 - leverage
         without = float(left[mine].mean()) / free
-        deviation = abs(without) * math.sqrt(free) / one.sigma_m
-        if deviation >= 4.0 and abs(without) >= 0.03:
+        std = one.sigma_m / math.sqrt(free)
+        p_value = exceeds(without, std, np.inf, tried=len(tapes.stated))
+        if p_value < FIT_LEVELS["distances"] and abs(without) >= 0.03:
             yield warning(
                 "wrong known distance",
                 f"the distance of tags {one.first} and {one.second}, {one.distance_m:.3f} m, is "
                 f"{100 * abs(without):.0f} cm {'more' if without > 0 else 'less'} than by all other data "
-                f"({deviation:.0f} standard errors)",
-                min(1.0, len(tapes.stated) * 2 * float(special.ndtr(-deviation))),
+                f"({abs(without) / std:.0f} standard errors)",
+                p_value,
             )

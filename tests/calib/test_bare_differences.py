@@ -142,6 +142,7 @@ def test_undetermined_differences_are_not_corrected(folder):
         calib.load_calibration(folder / "fit.json").apply(ranges)
 
 
+@pytest.mark.slow
 def test_a_tag_is_localized_by_differences(folder):
     words = ["calib", "localize", "fly/d.uwb", "-c", "fit.json", "--use", "receptions", "--seeds", "1", "--json"]
     (one,) = json.loads(processes.succeed(*words, cwd=folder).stdout)["scenarios"]
@@ -150,6 +151,7 @@ def test_a_tag_is_localized_by_differences(folder):
     assert one["rmse_m"]["variance"] < 0.045 < 0.08 < one["rmse_m"]["raw"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["constant-velocity", "imu"])
 def test_the_tag_is_tracked_on_board(folder, model):
     contents = uwblink.load(folder / "fly/d.uwb").select(stop_s=6.0)
@@ -165,6 +167,7 @@ def test_the_tag_is_tracked_on_board(folder, model):
     assert found.rmse_m < {"constant-velocity": 0.1, "imu": 0.06}[model]
 
 
+@pytest.mark.slow
 def test_a_calibration_of_ranges_corrects_differences(folder):
     """Its noise is that of a range; a difference has five times the variance."""
     random = np.random.default_rng(5)
@@ -229,11 +232,11 @@ def test_numbers_that_are_no_differences_are_left_out_and_counted(folder):
 @pytest.mark.slow
 def test_the_wrong_sign_has_a_warning_without_poses(folder):
     rows = flown(4, 4.0)
-    doubted = imported(folder / "blind", rows, swapped=True, mocap=False)
-    believed = imported(folder / "right", rows, mocap=False)
+    swapped = imported(folder / "blind", rows, swapped=True, mocap=False)
+    correct = imported(folder / "right", rows, mocap=False)
     words = ("-c", folder / "fit.json", "--use", "receptions", "--model", "constant-velocity")
-    assert "wrong unit or sign" in processes.succeed("calib", "localize", doubted, *words).stdout
-    assert "wrong unit or sign" not in processes.succeed("calib", "localize", believed, *words).stdout
+    assert "wrong unit or sign" in processes.succeed("calib", "localize", swapped, *words).stdout
+    assert "wrong unit or sign" not in processes.succeed("calib", "localize", correct, *words).stdout
 
 
 @pytest.mark.parametrize(

@@ -104,6 +104,7 @@ def test_programmed_delays_are_found_again(loop):
     assert by_base.stdout == (loop / "second.toml").read_text()
 
 
+@pytest.mark.slow
 def test_registers_do_not_change_the_constant_of_delayed_replies(loop):
     """The target's own stamp has a constant of the firmware's build, which causes errors of single-sided ranges."""
     record(scenario(DELAYS_NS), loop / "registers.uwb", loop / "registers.toml")

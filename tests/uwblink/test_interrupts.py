@@ -61,6 +61,7 @@ def files(folder):
     return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
 
 
+@pytest.mark.slow
 def test_a_sweep_says_that_what_was_done_is_kept_and_goes_on_with_it(tmp_path):
     text = (ROOT / "docs" / "examples" / "sweep.toml").read_text()
     plan, results = tmp_path / "sweep.toml", tmp_path / "results"

@@ -382,6 +382,7 @@ def test_calibrations_without_common_tags_are_not_compared(fitted):
         calib.compare(fitted, replace(fitted, delays_ns={99: 0.0}))
 
 
+@pytest.mark.slow
 def test_undetermined_pairs_are_named_and_other_pairs_corrected(tmp_path):
     """Two tags and two anchors; in the second flight the tags also range with each other."""
     flight = calib.sample_flight(180)

@@ -62,6 +62,7 @@ def test_p_values_account_for_the_number_of_tests():
     assert exceeds(0.5, 0.1, 9, tolerance=0.5) == 1
 
 
+@pytest.mark.slow
 def test_the_command_prints_findings_clocks_and_p_values(tmp_path):
     plan = Plan(seconds=20, per_second=60)
     sound, wrong = fly(plan, 91, 5), planted.doubled(planted.stepped(fly(plan, 92, 5), RNG(1)), RNG(2))

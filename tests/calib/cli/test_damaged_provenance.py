@@ -21,9 +21,9 @@ def surveyed(tmp_path_factory):
 @pytest.mark.parametrize(
     ("entry", "value"),
     [
-        (("rests_on",), None),
-        (("rests_on", "freedom"), "many"),
-        (("rests_on", "arrangements"), 3),
+        (("geometry",), None),
+        (("geometry", "freedom"), "many"),
+        (("geometry", "arrangements"), 3),
         (("pairs",), None),
         (("warnings",), 3),
         (("findings",), [1, "x"]),
@@ -52,3 +52,12 @@ def test_a_damaged_entry_is_one_line_where_it_is_used(surveyed, tmp_path, entry,
         if done.returncode:
             assert "its provenance is not as uwbcal writes it" in " ".join(done.stderr.split())
     assert page.exists() == (judged.returncode == 0)
+
+
+def test_calibrations_of_version_0_2_are_read_by_the_old_names_of_keys(surveyed):
+    _, document = surveyed
+    older = {"geometry": "rests_on", "undetermined_text": "left_open"}
+    provenance = {older.get(key, key): value for key, value in document["provenance"].items()}
+    assert "rests_on" in provenance
+    known = calib.Calibration.from_json(json.dumps(document | {"provenance": provenance}))
+    assert known == calib.Calibration.from_json(json.dumps(document))

@@ -89,6 +89,7 @@ def recording(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_known_positions_at_the_start_are_enough(recording, tmp_path):
     words = ("--truth", "ranges", "--poses-until", 4, "-o", tmp_path / "c.json")
     assert processes.succeed("calib", "fit", recording, *words).stdout.count(" delay ") == 6
@@ -145,6 +146,7 @@ def fitted(folder):
     return run("calib", "fit", folder / "ranges.uwb", "-o", folder / "c.json")
 
 
+@pytest.mark.slow
 def test_import_curve_localization(folder, fitted):
     assert "ranges without stamps" in fitted.stderr
     written = json.loads((folder / "c.json").read_text())

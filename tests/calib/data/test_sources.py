@@ -57,6 +57,7 @@ def test_a_file_an_open_recording_and_an_object_are_the_same(path):
     assert_same(both[:900], from_file)
 
 
+@pytest.mark.slow
 def test_every_function_accepts_the_sources_of_a_fit(tmp_path):
     in_memory = sample_flight(300)
     path = written(tmp_path / "sample.uwb", in_memory, in_memory.meta["planted"])
@@ -110,6 +111,15 @@ def test_localizing_and_examining_refuse_ranges():
         with pytest.raises(calib.BadInputError) as raised:
             call()
         assert raised.value.parameter == "data"
+
+
+def test_ranges_that_are_given_twice_are_refused_and_halves_are_not():
+    whole = calib.load_ranges(calib.sample_flight(600))
+    halves = [whole[:300], whole[300:]]
+    assert len(calib.load_ranges(halves)) == len(whole)
+    for twice in ([whole, whole], [*halves, whole[:300]]):
+        with pytest.raises(calib.BadInputError, match="same exchanges"):
+            calib.fit(twice)
 
 
 def test_arrays_become_ranges():
@@ -406,5 +416,7 @@ def test_a_clock_that_is_fast_by_stamps_only_is_named_with_its_effect():
     assert abs(found.stamps_ppm - found.carrier_ppm) == pytest.approx(5.0, abs=0.2)
     reply_s = float(np.median((some.tx2 - some.rx1) % 2**32)) * TICK_S
     assert found.moves_m == pytest.approx(0.5 * SPEED_OF_LIGHT * 5e-6 * reply_s, rel=0.05)
+    assert found.p_value < 1e-6
     findings = calib.fit(replace(calib.sample_flight(900), exchanges=some)).findings
-    assert ("clocks contradict the carriers", str(found)) in [(one.fault, one.evidence) for one in findings]
+    stated = "clocks contradict the carriers", str(found), found.p_value
+    assert stated in [(one.fault, one.evidence, one.p_value) for one in findings]

@@ -36,6 +36,7 @@ def test_draws_without_information_have_the_typical_variance():
     assert mean_variance(np.zeros(4), np.zeros(4), 0.035, BOUNDS) == pytest.approx(0.035**2, rel=0.01)
 
 
+@pytest.mark.slow
 def test_recordings_of_a_sound_world_do_not_differ():
     first, second = (make(CLEAN["iid"], 31, flight).ranges[::2] for flight in (0, 1))
     assert calib.fit(first).calibration.errors.between_m == 0.05

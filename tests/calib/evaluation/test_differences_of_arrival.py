@@ -151,6 +151,7 @@ def test_the_filter_includes_common_errors_of_listeners(heard):
     assert means[1] > 1.3 * means[0]
 
 
+@pytest.mark.slow
 def test_constants_of_both_pairs_in_a_difference_are_followed(heard):
     (problem,), rng = problems(load_flight(heard)), np.random.default_rng(6)
     true_m, zero = problem.ranges.arrivals.truth_m[problem.rows - len(problem.ranges)], np.zeros(len(problem))
@@ -165,6 +166,7 @@ def test_constants_of_both_pairs_in_a_difference_are_followed(heard):
     assert min(track.offsets[-1] for track in tracks["own"]) > 0.99
 
 
+@pytest.mark.slow
 def test_differences_alone_correct_a_wrong_start(known):
     settings = replace(LISTEN, initial_offset_m=(0.0, -8.0, 0.0), seeds=1)
     (found,) = calib.localize(flight(3104, 4.0), known, settings)

@@ -54,6 +54,7 @@ def clean(flight: Flight, sigma_m=0.08) -> tuple[Flight, Calibration]:
     return replace(flight, ranges=replace(ranges, raw_m=raw)), known
 
 
+@pytest.mark.slow
 def test_the_filter_is_consistent_on_clean_ranges(flights):
     # Without a gate, which rejects the largest hundredth of NIS.
     found = summarize(localize(*clean(flights["test1"]), Settings(gate=1e9, seeds=1)))
@@ -113,6 +114,7 @@ def test_a_calibration_reduces_the_error_by_a_third(flights, fitted):
     assert all(spread < 0.02 for spread in summary.spread_m.values())
 
 
+@pytest.mark.slow
 def test_fixed_variances_are_those_of_the_training_flight(flights, fitted):
     """With noise of 8 cm, values of the grid near it have the smallest error."""
     flight, exact = clean(beginning(flights["test1"], 8))
@@ -254,13 +256,13 @@ def test_mean_and_variance_of_the_noise_are_those_of_draws(draws, value):
     # Four standard errors, and the effect of the bin width.
     assert update.noise_m[0] == pytest.approx(noise[near].mean(), abs=4 * spread / np.sqrt(count) + 0.004)
     assert update.variance_m2[0] == pytest.approx(noise[near].var(), rel=6 / np.sqrt(count) + 0.05, abs=1e-4)
-    assert update.believed[0] == (np.mean(wild[near]) < 0.5)
+    assert update.accepted[0] == (np.mean(wild[near]) < 0.5)
     assert np.exp(update.log_density[0]) == pytest.approx(count / COUNT / 0.02, rel=4 / np.sqrt(count) + 0.03)
 
 
 def test_extreme_innovations_are_finite_and_rejected():
     update = mixture_update(np.array([-50.0, 1e3, 1e5]), np.full(3, STD**2), ERRORS)
-    assert not update.believed.any()
+    assert not update.accepted.any()
     assert np.isfinite(update.noise_m).all()
     np.testing.assert_allclose(update.noise_m, 0, atol=1e-6)
     np.testing.assert_allclose(update.variance_m2, STD**2, rtol=1e-6)
@@ -268,7 +270,7 @@ def test_extreme_innovations_are_finite_and_rejected():
 
 def test_a_gate_accepts_or_rejects():
     update = gated_update(np.array([0.2, 0.4]), np.full(2, 0.01), 9.0)
-    assert (update.believed.tolist(), update.noise_m.tolist()) == ([True, False], [0.2, 0.0])
+    assert (update.accepted.tolist(), update.noise_m.tolist()) == ([True, False], [0.2, 0.0])
     assert update.variance_m2.tolist() == [0.0, 0.01]
 
 

@@ -259,6 +259,7 @@ def test_patterns_are_corrected_by_the_estimated_pose():
     np.testing.assert_array_equal(alone.estimate_m, corrected.estimate_m)
 
 
+@pytest.mark.slow
 def test_without_a_heading_patterns_count_as_noise():
     turned, known = with_patterns(flight(10.0, seed=5), 0.25)
     settings = OnboardSettings(model="constant-velocity")
@@ -295,7 +296,8 @@ def test_recordings_without_needed_data_are_refused(change, settings, error, sai
         localize_onboard(replace(contents, **change(contents)), calibration(), OnboardSettings(**settings))
 
 
-@pytest.mark.parametrize("seed", [41, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (42, 43))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [41, 42, 43])
 def test_a_body_that_only_listens_is_localized_consistently(seed):
     settings = OnboardSettings(noise=IMU, use="receptions")
     (track,) = localize_onboard(listening(seed=seed), calibration(), settings)
@@ -311,6 +313,7 @@ def test_a_body_that_only_listens_is_localized_consistently(seed):
     assert track.restarts_s == ()
 
 
+@pytest.mark.slow
 def test_differences_need_no_true_poses():
     heard = listening(8.0)
     blind = replace(heard, poses=heard.poses[heard.poses.body != "drone"])

@@ -37,6 +37,7 @@ def wrong_m(delays_ns, drift_m):
     return np.array([LIGHT / 2 * (off[1] + off[tag]) for tag in range(11, 17)])
 
 
+@pytest.mark.slow
 def test_the_command_compares_states_with_fixed_delays_and_prints_their_end(known, tmp_path):
     known.save(tmp_path / "known.json")
     drift_m = {1: 0.06, 2: 0.06}
@@ -74,7 +75,7 @@ def test_residuals_are_those_of_the_likelihood(known):
     np.testing.assert_allclose(residual**2 / 2, best - many.weigh(around).log_density, atol=1e-6)
     assert np.all(np.diff(residual) > 0)
     # Outliers have no information: their slope is not compared where they are likely.
-    inside = many.weigh(around).believed
+    inside = many.weigh(around).accepted
     further = (many.whiten(around + 1e-6)[0] - many.whiten(around - 1e-6)[0]) / 2e-6
     np.testing.assert_allclose(slope[inside], further[inside], rtol=0.02, atol=1e-3)
     with pytest.raises(BadInputError, match="range 1 has no power"):

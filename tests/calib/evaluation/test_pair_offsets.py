@@ -61,6 +61,7 @@ def test_without_constants_of_pairs_the_filter_is_as_accurate(known):
     assert np.mean([one.offsets.mean() for one in own]) < 0.2
 
 
+@pytest.mark.slow
 def test_the_command_reports_that_pairs_differ(known, tmp_path):
     known.save(tmp_path / "known.json")
     for name, offset_m in (("same", 0.0), ("differs", OFFSET_M)):

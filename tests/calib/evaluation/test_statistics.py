@@ -162,6 +162,7 @@ def test_wrong_settings_of_held_out_ranges_are_refused(changes, error):
 # Evaluating a calibration on its fitted recording gives a warning.
 
 
+@pytest.mark.slow
 def test_recordings_are_identified_by_content(tmp_path):
     train, test = calib.sample_flight(), calib.sample_flight(seed=2)
     for folder, flight in (("a", train), ("b", test), ("c", train)):

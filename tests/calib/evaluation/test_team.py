@@ -265,7 +265,8 @@ def test_poses_after_the_start_are_only_for_evaluation(known):
         assert np.isfinite(tracks[2].rmse_m)
 
 
-@pytest.mark.parametrize("seeds", [(305,), pytest.param((305, 306), marks=pytest.mark.slow)], ids=len)
+@pytest.mark.slow
+@pytest.mark.parametrize("seeds", [(305,), (305, 306)], ids=len)
 def test_the_filter_includes_common_errors_of_listeners(known, monkeypatch, seeds):
     def drawn(ranges, *_, **__):
         rng, heard, count = np.random.default_rng(8), ranges.arrivals, len(ranges)
@@ -285,6 +286,7 @@ def test_the_filter_includes_common_errors_of_listeners(known, monkeypatch, seed
     assert figures["raw"]["nees"] > 1.3 * figures["variance"]["nees"]
 
 
+@pytest.mark.slow
 def test_patterns_are_corrected_by_the_estimated_poses():
     """The antennas of all robots add 20 cm to the front: exact ranges are exact after the correction."""
     t, ends, measured = ranging(4.0, 2)
@@ -377,6 +379,7 @@ def test_an_option_of_another_model_is_refused(option, used_by, tmp_path):
         assert said.startswith(f"error: {option[0]}: can only be used with --model ") == (model not in used_by)
 
 
+@pytest.mark.slow
 def test_the_command_prints_writes_and_refuses(known, tmp_path):
     recording, document, flown = tmp_path / "three.uwb", tmp_path / "c.json", simulated(307, 1.0)
     flown.save(recording)
@@ -401,6 +404,7 @@ def test_the_command_prints_writes_and_refuses(known, tmp_path):
     processes.refuse(*words, "--start-std", "0", "1", "1", naming=["--start-std:"])
 
 
+@pytest.mark.slow
 def test_delays_that_a_calibration_has_wrong_within_its_errors_are_corrected_on_the_way():
     off = dict(zip(ARMS, [0.4, -0.3, 0.5, 0.3, -0.4, 0.3], strict=True))
     known = replace(PLANTED, delays_ns=off, delays_std_ns=dict.fromkeys(ARMS, 0.4))

@@ -73,7 +73,8 @@ def test_a_planted_pattern_is_found_within_its_intervals(size_m, own):
     assert max(error) < (0.008 if own else 0.004)
 
 
-@pytest.mark.parametrize("own", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("own", [False, True])
 def test_another_flight_is_corrected_by_directions_from_its_poses(own, tmp_path):
     recipe = replace(SHORT, own=own)
     first, second = written(tmp_path / "a.uwb", recipe, 3), written(tmp_path / "b.uwb", recipe, 3, 1)

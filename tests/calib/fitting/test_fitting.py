@@ -63,8 +63,10 @@ def test_the_sign_of_a_pairs_error_is_stated(by_m, way):
     second = some.initiator + some.target - first
     off = by_m * ((first == 2) & (second == 7))
     found = calib.fit(replace(some, initiator=first, target=second, raw_m=some.raw_m + off))
-    (said,) = [warning for warning in found.warnings if warning.startswith("pair 2-7") and "initiates" in warning]
-    assert f"{way} if tag 2 initiates" in said
+    (named,) = [one for one in found.findings if one.evidence.startswith("pair 2-7") and "initiates" in one.evidence]
+    assert f"{way} if tag 2 initiates" in named.evidence
+    assert named.p_value is not None
+    assert 0 < named.p_value < 1e-6
 
 
 def test_errors_of_undetermined_fits_state_the_reason():

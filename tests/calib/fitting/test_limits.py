@@ -157,12 +157,13 @@ def test_skew_of_single_sided_ranges_is_bounded_by_their_reply():
         "truth_m": 3.0 + np.arange(count) % 5 * 0.01,
     }
     plain = uwblink.Exchanges.from_arrays(ids[:, 0], ids[:, 1], **base, **powers, time_ns=np.arange(count) * 10**7)
-    left = calib.load_ranges(plain).left_skew
+    left = calib.load_ranges(plain).uncorrected_skew
     # c/2 x 40 ppm x 300.5 us, by hand.
     assert left.bound_m == pytest.approx(0.5 * 299_702_547 * 40e-6 * 300.5e-6, rel=1e-3)
-    assert math.isnan(left.told_m)
+    assert math.isnan(left.read_m)
     assert "1.8 m (c/2 x 40 ppm x 300 µs of reply)" in told(calib.fit(plain, delays_only=True), "without carrier")
     read = replace(plain, skew2_ppm=np.full(count, 2.0))
-    assert calib.load_ranges(read).left_skew.told_m == pytest.approx(0.5 * 299_702_547 * 2e-6 * 300.5e-6, rel=1e-3)
+    skew = calib.load_ranges(read).uncorrected_skew
+    assert skew.read_m == pytest.approx(0.5 * 299_702_547 * 2e-6 * 300.5e-6, rel=1e-3)
     assert "imported with protocol ss-cfo" in told(calib.fit(read, delays_only=True), "clock skew in them")
-    assert calib.load_ranges(replace(read, protocol=np.full(count, "ss-cfo"))).left_skew is None
+    assert calib.load_ranges(replace(read, protocol=np.full(count, "ss-cfo"))).uncorrected_skew is None

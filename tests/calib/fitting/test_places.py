@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import signal
 
 import calib
-from calib.checks.limits import power_levels_db, unlike_power_levels
+from calib.checks.limits import differing_power_levels, power_levels_db
 from calib.data.ranges import concatenate
 from tests.calib import synthetic
 from tests.calib.fitting.fields import ranges_with_field
@@ -26,6 +27,7 @@ def named(result):
     return [warning for warning in result.warnings if warning.startswith("errors depend on places")]
 
 
+@pytest.mark.slow
 def test_offsets_between_bodies_that_last_are_in_the_intervals_and_named():
     # If the bodies were unknown, pairs would count as independent, and intervals would hold in half of the cases.
     blind, seeing = [], []
@@ -75,8 +77,11 @@ SENT_DB, READ_DB = {2: -3.0}, {3: 2.0}
 NOBODY: dict[int, float] = {}
 
 
-def world(sent=NOBODY, read=NOBODY, noise_db=0.0, **more):
-    """Errors depend on the powers that arrive; recorded are the readings of the tags."""
+def world(sent=NOBODY, read=NOBODY, noise_db=0.0, lasting=None, **more):
+    """Errors depend on the powers that arrive; recorded are the readings of the tags.
+
+    Errors of readings of 1.5 dB that last for about 300 exchanges are added with a seed `lasting`.
+    """
     rng = np.random.default_rng(3)
     r = ranges(**({"n": 6000} | more))
     # The path loss is equal in both directions: both powers are reduced by the same.
@@ -85,8 +90,24 @@ def world(sent=NOBODY, read=NOBODY, noise_db=0.0, **more):
     def gain(table, tags):
         return np.array([table.get(tag, 0.0) for tag in range(8)])[tags]
 
-    fpp1 = r.fpp1_dbm + gain(sent, r.initiator) + gain(read, r.target) + noise_db * rng.normal(size=len(r))
-    fpp2 = r.fpp2_dbm + gain(sent, r.target) + gain(read, r.initiator) + noise_db * rng.normal(size=len(r))
+    memory = np.exp(-1 / 300)
+    steps = np.random.default_rng(lasting).normal(size=(8, len(r) + 3000)) * np.sqrt(1 - memory**2)
+    wander_db = 1.5 * (lasting is not None) * signal.lfilter([1], [1, -memory], steps)[:, 3000:]
+    rows = np.arange(len(r))
+    fpp1 = (
+        r.fpp1_dbm
+        + gain(sent, r.initiator)
+        + gain(read, r.target)
+        + noise_db * rng.normal(size=len(r))
+        + wander_db[r.target, rows]
+    )
+    fpp2 = (
+        r.fpp2_dbm
+        + gain(sent, r.target)
+        + gain(read, r.initiator)
+        + noise_db * rng.normal(size=len(r))
+        + wander_db[r.initiator, rows]
+    )
     return replace(r, fpp1_dbm=fpp1, fpp2_dbm=fpp2)
 
 
@@ -113,7 +134,7 @@ def test_ranges_without_powers_have_no_levels():
     r = world()
     bare = replace(r, fpp2_dbm=np.full(len(r), np.nan))
     assert power_levels_db(bare) == {}
-    assert not [*unlike_power_levels(bare, calib.fit(r).calibration)]
+    assert not [*differing_power_levels(bare, calib.fit(r).calibration)]
 
 
 def test_a_tag_that_reads_too_high_is_named_with_what_its_delay_holds():
@@ -126,6 +147,18 @@ def test_a_tag_that_reads_too_high_is_named_with_what_its_delay_holds():
     # curve.
     assert 1e3 * abs(away[2] - np.mean(np.delete(away, 2))) == pytest.approx(held_ps, rel=0.2)
     assert held_ps > 50
+
+
+def test_errors_of_readings_that_last_are_no_difference_of_tags():
+    """Standard errors of independent readings would be a tenth of the errors of levels."""
+    for seed in range(11_000, 11_004):
+        sound, faulty = (world(read=read, lasting=seed) for read in (NOBODY, {3: 4.0}))
+        assert all(abs(level) < 5 * std for level, std in power_levels_db(sound).values())
+        assert "power levels of tags" not in [one.fault for one in calib.fit(sound).findings]
+        (named,) = [one for one in calib.fit(faulty).findings if one.fault == "power levels of tags"]
+        assert named.evidence.startswith("powers of tag 3 (+")
+        assert named.p_value is not None
+        assert named.p_value < 1e-4
 
 
 # Lengths and powers in other units than metres and dBm: they are not fitted, and the unit is named.

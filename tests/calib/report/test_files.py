@@ -130,6 +130,7 @@ def test_too_few_ranges_are_evaluated_on_themselves(folder):
         calib.run_campaign(few, loss="l2", hold_out=0.3)
 
 
+@pytest.mark.slow
 def test_undetermined_delays_are_one_warning(tmp_path, sections):
     """One tag ranges with all others."""
     flights = [calib.sample_flight(seed=seed) for seed in (1, 2)]
@@ -252,6 +253,7 @@ def test_plans_have_a_figure_of_each_arrangement(tmp_path):
     assert in_space.count("5") >= 3
 
 
+@pytest.mark.slow
 def test_planned_flights_have_figures_of_path_intervals_and_gains(tmp_path):
     words = ["plan", "flight", "2", "--duration", "8", "--rate", "40", "--anchor-tags", "11,12,13,14"]
     run(tmp_path, *words, "--anchors", "sought", "--poses-until", "4", "-o", "plan.html")

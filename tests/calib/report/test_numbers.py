@@ -397,11 +397,11 @@ def grades(known: calib.Calibration) -> dict[str, str]:
 def test_each_criterion_of_a_survey_fails_for_its_fault(surveyed):
     known = surveyed.calibration
     assert set(grades(known).values()) == {"good"}
-    rests = known.provenance["rests_on"]
+    geometry = known.provenance["geometry"]
     sick = {
         CONTRADICTED: {"findings": ["A: the boards are not on a line"]},
-        "Do the arrangements check each other?": {"rests_on": rests | {"freedom": 2.0}},
-        "Are the constant errors of pairs small enough?": {"rests_on": rests | {"pair_error_m": 0.2}},
+        "Do the arrangements check each other?": {"geometry": geometry | {"freedom": 2.0}},
+        "Are the constant errors of pairs small enough?": {"geometry": geometry | {"pair_error_m": 0.2}},
         "Are few pairs reflected?": {"reflected": [{"chance": 1.0}] * 9},
     }
     for question, parts in sick.items():
@@ -434,8 +434,8 @@ def test_reports_of_surveys_have_positions_and_reflected_pairs(surveyed):
 
 def test_reports_without_motion_capture_state_known_facts(known):
     assert (foundations(known), grades(known)) == ([], {})
-    rests = {"moving": ["robot"], "known_s": 10.0, "anchors_given": ["a", "b"], "attitudes": "ahrs"}
-    blind = changed(known, truth="ranges", rests_on=rests, distance_std_m=0.03)
+    geometry = {"moving": ["robot"], "known_s": 10.0, "anchors_given": ["a", "b"], "attitudes": "ahrs"}
+    blind = changed(known, truth="ranges", geometry=geometry, distance_std_m=0.03)
     _, text, table = foundations(blind)
     assert [type(text), type(table)] == [Text, Table]
     assert "positions known for 10.0 s" in text.text

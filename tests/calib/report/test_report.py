@@ -158,6 +158,7 @@ def test_planted_delays_are_shown_beside_fitted_ones(campaign):
     assert table.header == ["tag", "delay (ns)", "95 % from", "to"]
 
 
+@pytest.mark.slow
 def test_a_campaign_s_tables_have_the_numbers_of_its_test(campaign):
     """Shares beyond three sigma by side, and the gains of filters, whose signs must be those of the page."""
     run("calib", "fit", "train.uwb", "-o", "same.json", cwd=campaign)

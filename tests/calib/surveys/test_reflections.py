@@ -33,7 +33,7 @@ def linear():
     spread = jacobian[:, free] @ np.linalg.inv(prior[np.ix_(free, free)]) @ jacobian[:, free].T
     seen = left + jacobian[:, free] @ (x - centre)[free]
 
-    def unlikely(marks):
+    def deviance(marks):
         marks = np.array(marks, dtype=float)
         own = network.means.std_m**2 + PAIR_M**2 + 0.25**2 * marks
         count = marks.sum()
@@ -46,22 +46,22 @@ def linear():
         longer = np.log((ndtr(detour / std) + 0.01) / (ndtr(0.3 / 0.25) + 0.01)).sum()
         return np.linalg.slogdet(covariance)[1] + away @ np.linalg.solve(covariance, away) - 2 * share - 2 * longer
 
-    return Marks.at(network, x, Case(np.zeros(rows, dtype=bool), PAIR_M, CURVE_M)), unlikely
+    return Marks.at(network, x, Case(np.zeros(rows, dtype=bool), PAIR_M, CURVE_M)), deviance
 
 
 def test_the_search_and_the_weights_are_those_of_the_likelihood_written_out(linear):
-    none, unlikely = linear
+    none, deviance = linear
     marks = none.search()
     assert marks.any()
-    here = unlikely(marks)
+    here = deviance(marks)
     # No change of two rows is more likely.
     for rows in [*combinations(range(len(marks)), 1), *combinations(range(len(marks)), 2)]:
         other = marks.copy()
         other[list(rows)] ^= True
-        assert unlikely(other) > here - 1e-3
+        assert deviance(other) > here - 1e-3
     found, weight = none.window()
     assert len(weight) > 3
-    value = np.array([unlikely(marks) for marks in found])
+    value = np.array([deviance(marks) for marks in found])
     expected = np.exp(-0.5 * (value - value.min()))
     # The explicit covariance has numbers from 1e-4 to 1e6.
     assert weight == pytest.approx(expected / expected.sum(), rel=5e-3)

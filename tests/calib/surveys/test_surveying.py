@@ -75,6 +75,7 @@ def test_planted_delays_lie_within_their_intervals(shape, boards, count):
     assert_sound(world, calib.survey(world.ranges, known="" if shape == "space" else shape))
 
 
+@pytest.mark.slow
 def test_intervals_of_delays_and_places_hold_in_the_stated_frame():
     world = standing_boards(40, "plane", boards=5, arrangements=5)
     result = calib.survey(world.ranges, known="plane")
@@ -117,6 +118,7 @@ def test_one_arrangement_in_space_determines_nothing_and_names_the_boards():
     assert caught.value.undetermined == [[1, 2, 3, 4, 5]]
 
 
+@pytest.mark.slow
 def test_a_curve_over_power_is_found_along_with_the_delays():
     world = standing_boards(2, "plane", boards=5, arrangements=6, bias_size_m=0.06, size_m=9.0, pair_error_m=0.01)
     result = calib.survey(world.ranges, known="plane")
@@ -218,7 +220,7 @@ def test_errors_that_last_within_an_arrangement_widen_intervals():
 def test_few_arrangements_widen_intervals_by_students_quantile():
     result = calib.survey(standing_boards(5, boards=3, arrangements=3).ranges, known="line")
     # The prior of the pair error counts as three degrees of freedom (docs/theory.md).
-    wider = student.ppf(0.975, result.calibration.provenance["rests_on"]["freedom"] + 3) / norm.ppf(0.975)
+    wider = student.ppf(0.975, result.calibration.provenance["geometry"]["freedom"] + 3) / norm.ppf(0.975)
     assert wider > 1.05
     found = [result.calibration.delays_std_ns[t] for t in sorted(result.calibration.delays_ns)]
     assert found == pytest.approx(result.verdict.std[result.verdict.determined] * wider, rel=1e-6)
@@ -282,7 +284,7 @@ def crooked_line():
     return (
         standing_boards(2, places=places, pair_error_m=0.01),
         "line",
-        "arrangement not as it is said to be",
+        "arrangement not as stated",
         "^3: the boards are not on a line",
     )
 
@@ -298,7 +300,7 @@ def test_wrong_known_facts_are_named(mistake):
     assert chance is not None
     assert 0 <= chance < 0.01
     assert max(map(abs, scores(result, world.delays_ns).values())) < 4
-    if kind == "arrangement not as it is said to be":
+    if kind == "arrangement not as stated":
         assert [one.known for one in result.arrangements] == ["line", "line", "plane", "line", "line"]
 
 
@@ -394,7 +396,7 @@ def test_the_command_accepts_a_recording_per_arrangement(recording, tmp_path):
     assert {one["known"] for one in told["arrangements"]} == {"line"}
     known = calib.load_calibration(out)
     assert known.provenance["recipe"] == "survey"
-    assert known.provenance["rests_on"]["arrangements"][1] == {"name": "B", "known": "line", "tags": [1, 2, 3, 4]}
+    assert known.provenance["geometry"]["arrangements"][1] == {"name": "B", "known": "line", "tags": [1, 2, 3, 4]}
     assert max(abs(d - ANCHOR_DELAYS_NS[t]) for t, d in known.delays_ns.items()) < 0.2
     rows = tomllib.loads(anchors.read_text())["anchors"]
     assert [row["id"] for row in rows] == [1, 2, 3, 4]

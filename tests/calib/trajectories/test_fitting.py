@@ -42,8 +42,8 @@ def test_planted_delays_are_found_from_a_known_start(flown):
     assert np.std(away) < 0.02
     assert abs(np.mean(away)) < 0.01
     known = result.calibration.provenance
-    assert (known["truth"], known["rests_on"]["known_s"]) == ("ranges", pytest.approx(7.9, abs=0.11))
-    assert known["rests_on"]["moving"] == ["robot0", "robot1", "robot2"]
+    assert (known["truth"], known["geometry"]["known_s"]) == ("ranges", pytest.approx(7.9, abs=0.11))
+    assert known["geometry"]["moving"] == ["robot0", "robot1", "robot2"]
     # The stated standard error agrees with the errors.
     assert known["distance_std_m"] == pytest.approx(np.std(away), rel=0.5)
     assert (shares, shares[-1]) == (sorted(shares), 1.0)
@@ -68,6 +68,7 @@ def test_calibrations_without_distances_correct_other_flights(known):
     assert abs(np.median(applied.raw_m - other.distance_m)) > 0.012
 
 
+@pytest.mark.slow
 def test_a_curve_is_taken_from_another_calibration_with_its_uncertainty(known):
     flown = flight(seconds=8.0, seed=3)
     given: dict[str, Any] = {"poses_until_s": 5.0, "heading_std_deg": 0.0}
@@ -111,7 +112,7 @@ def test_positions_of_anchors_replace_a_known_start():
     # Lever arms of anchors are 37 cm long, each with another direction.
     assert np.std(distance_errors(result, flown)) < 0.03
     std = np.sqrt(np.diag(result.calibration.uncertainty.delays_ns2))
-    assert result.calibration.provenance["rests_on"]["known_s"] == 0
+    assert result.calibration.provenance["geometry"]["known_s"] == 0
     assert np.abs(scores(result)).max() < 3.5
     assert std[:6].max() < 0.15
 
@@ -124,7 +125,7 @@ def test_estimated_anchors_do_not_spoil_a_known_start():
     # In a flight in the middle of the room, an anchor's position and its delay have nearly the same effect.
     assert all(np.isinf(result.calibration.delays_std_ns[tag]) for tag in (11, 12, 13, 14))
     assert "tags 11, 12, 13, 14" in result.warnings[0]
-    assert result.calibration.provenance["rests_on"]["anchors_sought"] == [f"anchor{tag}" for tag in (11, 12, 13, 14)]
+    assert result.calibration.provenance["geometry"]["anchors_sought"] == [f"anchor{tag}" for tag in (11, 12, 13, 14)]
 
 
 @pytest.mark.slow

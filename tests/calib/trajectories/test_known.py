@@ -57,7 +57,7 @@ def test_a_measured_distance_determines_the_common_delay():
     assert abs(error) < 3 * std
     truth = flown.distance_m[np.searchsorted(flown.exchanges.time_ns, result.ranges.time_ns)]
     assert abs(np.mean(result.ranges.truth_m - truth)) < 0.05
-    assert result.calibration.provenance["rests_on"]["distances"] == 1
+    assert result.calibration.provenance["geometry"]["distances"] == 1
 
 
 def test_a_wrong_measured_distance_is_named():
@@ -65,12 +65,14 @@ def test_a_wrong_measured_distance_is_named():
     # A distance without an arrangement does not state when the bodies stood still.
     tapes = [by_tape(flown, 1, 3, 0.3), by_tape(flown, 2, 5), KnownDistance(2, 3, 2.0, 0.02)]
     result = calib.fit_from_ranges(flown, distances=tapes, **KNOWN_START)
-    (named,) = [warning for warning in result.warnings if "measure it again" in warning]
-    told = re.match(r"the distance of tags 1 and 3, 3\.952 m, is ([\d.]+) .* more than ", named)
+    (named,) = [one for one in result.findings if one.fault == "wrong known distance"]
+    told = re.match(r"the distance of tags 1 and 3, 3\.952 m, is ([\d.]+) .* more than ", named.evidence)
+    assert named.p_value is not None
+    assert named.p_value < 1e-4
     # Thirty centimetres, within the accuracy of 16 ranges of the pair and known positions of 2 cm.
     assert 25 < float(told[1]) < 35
     assert [text for text in result.warnings if "tags 2 and 3 is not used" in text]
-    assert result.calibration.provenance["rests_on"]["distances"] == 2
+    assert result.calibration.provenance["geometry"]["distances"] == 2
 
 
 def test_the_weight_of_a_distance_is_independent_of_its_duration():
@@ -126,7 +128,7 @@ def test_heights_resolve_the_mirror_image_of_anchors_in_a_plane():
     assert ["a second solution" in " ".join(one.warnings) for one in (without, result)] == [True, False]
     assert common(result)[1] < 0.75 * common(without)[1]
     assert abs(common(result)[0]) < 3 * common(result)[1]
-    assert result.calibration.provenance["rests_on"]["heights"] == ["robot0", "robot1", "robot2"]
+    assert result.calibration.provenance["geometry"]["heights"] == ["robot0", "robot1", "robot2"]
 
 
 @pytest.mark.parametrize(

@@ -230,6 +230,7 @@ def test_the_page_shows_printed_ranges_and_their_corrections(tmp_path):
             uwblink.boards.record_printed([port], tmp_path / "s.uwb", dialect_of("arduino"), **how)
 
 
+@pytest.mark.slow
 def test_a_stream_is_recorded_as_well_and_the_command_serves_the_page(tmp_path):
     calibrated(tmp_path, 40, 6018)
     with printing(BOTH.splitlines(keepends=True)[0]) as port:

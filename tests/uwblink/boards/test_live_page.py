@@ -217,6 +217,7 @@ def test_pages_of_an_earlier_recorder_are_detected(tmp_path):
     assert "old.uwb" not in before + after, "what is not fetched again says nothing of a recording"
 
 
+@pytest.mark.slow
 def test_a_browser_shows_the_live_page_and_updates_it(tmp_path):
     """Headless Chromium runs the script under the page's own policy, and fetches the body again."""
 

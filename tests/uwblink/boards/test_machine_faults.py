@@ -176,6 +176,7 @@ def test_a_read_only_folder_loses_no_data():
         assert after.turns > 200
 
 
+@pytest.mark.slow
 def test_two_recorders_cannot_have_one_file(tmp_path):
     path = tmp_path / "f.uwb"
     found: list[subprocess.CompletedProcess[str]] = []

@@ -136,6 +136,7 @@ def test_an_unplugged_board_leaves_the_others_running_and_resumes(tmp_path):
     assert np.any(again), "passive listening was lost with the power and is restored"
 
 
+@pytest.mark.slow
 def test_hanging_boards_and_damaged_lines_are_faults_without_wrong_ranges(tmp_path):
     path, counts = tmp_path / "f.uwb", Progress()
     faults = [

@@ -58,6 +58,7 @@ def test_panels_stand_beside_each_other_on_a_page_and_above_each_other_in_a_colu
     assert [axes.get_subplotspec().get_geometry()[:2] for axes in (wide.axes[0], narrow.axes[0])] == [(1, 2), (2, 1)]
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_once_for_all_files():
     calls = []
 

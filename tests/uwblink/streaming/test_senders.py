@@ -168,6 +168,7 @@ def test_used_ports_and_missing_extras_are_named(monkeypatch):
         FoxgloveServer("0")
 
 
+@pytest.mark.slow
 def test_ranges_arrive_within_20_ms_of_their_poll(ear):
     """By the time of the boards, so that other load has no effect; docs/boards.md has the figures."""
     ports, late_ms = VirtualPorts(bench_scenario()), []

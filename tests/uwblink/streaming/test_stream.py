@@ -203,6 +203,7 @@ def test_the_commands_refuse_a_calibration_of_other_boards_and_write_nothing(tmp
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_a_stream_ends_if_its_reader_closes_the_pipe(flown):
     words = f"{BIN / 'uwblink'} stream {flown} --speed 20 | head -n 2"
     done = subprocess.run(["bash", "-c", words], capture_output=True, text=True, timeout=120)

@@ -260,6 +260,7 @@ def test_the_file_holds_every_pose_up_to_now_and_none_after(tmp_path):
     poses.close()
 
 
+@pytest.mark.slow
 def test_poses_are_those_of_the_world_and_do_not_depend_on_the_pieces(tmp_path):
     world = World(flight(position_noise_m=0.001, attitude_noise_rad=0.01, gaps_per_min=20.0))
     one = written(world, tmp_path / "one.csv", [30.0])

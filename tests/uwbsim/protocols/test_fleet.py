@@ -98,6 +98,7 @@ def test_costs_are_those_of_the_frames():
     assert {one.tags for one in fifty.values()} == {50}
 
 
+@pytest.mark.slow
 def test_predict_and_compare_print_the_fleet(tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "drawn", pages.outline)
     words = ("predict", "--tags", "8", "--delay-initiator-ns", "3")

@@ -276,6 +276,7 @@ def test_prediction_has_the_closed_form(protocol):
     np.testing.assert_allclose(np.sqrt(found.parts_m2["clocks"]), closed_form_m(protocol), rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_served_boards_lose_as_much():
     first = Board(uwbsim.VirtualPorts(scenario()).port(1))
     ranges = [first.range(2).range_m for _ in range(200)]

@@ -111,6 +111,7 @@ def test_a_process_that_dies_is_replaced_and_several_give_the_same_bytes(alone, 
     assert (tmp_path / "out" / "results.csv").read_bytes() == (out / "results.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_chunk_that_a_broken_pool_never_reports_is_done_again(alone, tmp_path, monkeypatch):
     p, out = alone
 

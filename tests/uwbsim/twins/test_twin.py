@@ -88,6 +88,7 @@ def test_the_schedule_is_found(found):
     assert (ranging.response_delay_uus, list(ranging.pairs)) == (1500, [(11, 12), (11, 13), (12, 13)])
 
 
+@pytest.mark.slow
 def test_a_saved_twin_flies_the_same_ways(found, flight, tmp_path):
     found.save(tmp_path / "t.toml")
     again = uwbsim.simulate(tmp_path / "t.toml", contention=False)
