@@ -262,18 +262,25 @@ SAME_LEVEL_DB: Final = 0.5
 """Smaller differences of levels of tags are ignored; medians of a pair's ranges are known to a tenth of this."""
 
 
-def differing_power_levels(ranges: Ranges, calibration: Calibration) -> Iterator[Finding]:
+def differing_power_levels(found: RangeFit, ranges: Ranges, calibration: Calibration) -> Iterator[Finding]:
     """Yield a finding about tags whose powers differ from the others so much that their delays may contain an error.
 
     A frame and its answer take the same path, so a difference of their powers is due to the tags: transmit power and
     error of readings. Only the sum is visible. If a tag reads powers too high, its ranges get the correction of
-    stronger ones, and its delay absorbs the mean of this difference: right for its ranges, wrong for its antenna.
+    stronger ones, and its delay absorbs the mean of this difference: right for its ranges, wrong for its antenna. An
+    effect within the interval of the delay is no finding. Such an effect can also look like other faults, so this is
+    the interval before any fault has widened it.
     """
     levels = power_levels_db(ranges)
     if not levels:
         return
     each_ns = _ns_a_decibel(ranges, calibration)
-    half_ns = {tag: TWO_SIDED_95 * calibration.delays_std_ns.get(tag, 0.0) for tag in levels}
+    std_ns = np.sqrt(np.maximum(np.diag(found.covariances["delay"]), 0.0)).tolist()
+    half_ns = dict.fromkeys(levels, 0.0) | {
+        int(name): TWO_SIDED_95 * std
+        for name, std in zip(found.model.unknowns[0].names, std_ns, strict=True)
+        if found.model.settings.constants == "tag"
+    }
     differing = {
         tag: (level, p_value)
         for tag, (level, std) in levels.items()

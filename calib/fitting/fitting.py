@@ -317,7 +317,7 @@ def result_of(
         *more,
         *findings,
         *implausible_values(calibration.delays_ns, residuals),
-        *differing_power_levels(ranges, calibration),
+        *differing_power_levels(found, ranges, calibration),
         *_without_reference_power(found),
         *limits_of_data(ranges, float(np.mean(inliers)), found.blocks.seconds),
     ]
