@@ -586,7 +586,9 @@ def feature_rows(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 def curve_rows(calibration: Calibration) -> list[tuple[str, ...]]:
     """Return a row of lifted powers, and rows of the values of the curves there, for each group of tags."""
-    shown = np.linspace(*calibration.bias_curve.range, 6)
+    low, high = calibration.bias_curve.range
+    # A fit at one power, or without powers, has a range without extent.
+    shown = np.linspace(low, high, 6 if high > 1.01 * low else 1)
     named: dict[str, Calibration | TagGroup] = dict(calibration.groups) or {"": calibration}
     rows = [("lifted power", *(f"{power:.3g}" for power in shown))]
     for name, curves in named.items():

@@ -314,7 +314,7 @@ OFFSET_FAULTS = {
     ),
     "scale": (
         "scale of true distances",
-        "ranges grow with the distance by {size} too {way} over the recorded distances, which changes {worst}",
+        "ranges grow with the distance by {size} too {growth} over the recorded distances, which changes {worst}",
     ),
     "late": (
         "time offset of true distances",
@@ -332,6 +332,7 @@ def finding_of(offset: FoundOffset) -> Finding:
         "whose": " or ".join(offset.names),
         "size": f"{100 * abs(offset.offset_m):.1f} cm",
         "way": "long" if offset.offset_m > 0 else "short",
+        "growth": "much" if offset.offset_m > 0 else "little",
         "worst": f"delays by up to {max(1e3 * offset.largest_ns, 1):.0f} ps",
         "p": offset.p_value,
         "own": own,

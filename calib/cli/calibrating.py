@@ -290,9 +290,9 @@ def _survey_lines(facts: object) -> Iterator[str]:
     rows = [row for row in listed if isinstance(row, dict)] if isinstance(listed, list) else []
     for shape in dict.fromkeys(str(row.get("known", "")) for row in rows):
         names = ", ".join(str(row.get("name")) for row in rows if row.get("known", "") == shape)
-        yield f"rests on arrangements {names}{f', on a {shape}' if shape else ''}"
+        yield f"arrangements: {names}{f', on a {shape}' if shape else ''}"
     distances, positions = facts.get("known_distances", 0), facts.get("known_positions", 0)
-    yield f"rests on {distances} known distances and {positions} known positions"
+    yield f"known: {distances} distances and {positions} positions"
 
 
 def sample(

@@ -125,7 +125,7 @@ def test_the_survey_prints_what_the_page_shows(done):
     _, said = done
     (shown,) = blocks("text survey")
     pages.compare(said["survey"], shown)
-    assert "rests on arrangements A, B, C, D, E, F, G, H, on a line" in said["show"]
+    assert "arrangements: A, B, C, D, E, F, G, H, on a line" in said["show"]
     assert "from the geometry of boards that stood still" in said["show"]
 
 
