@@ -61,3 +61,10 @@ def test_calibrations_of_version_0_2_are_read_by_the_old_names_of_keys(surveyed)
     assert "rests_on" in provenance
     known = calib.Calibration.from_json(json.dumps(document | {"provenance": provenance}))
     assert known == calib.Calibration.from_json(json.dumps(document))
+
+
+def test_flat_curves_are_shown_at_one_power(surveyed):
+    _, document = surveyed
+    text = repr(calib.Calibration.from_json(json.dumps(document)))
+    (line,) = [line for line in text.splitlines() if line.startswith("  lifted power")]
+    assert len(line.removeprefix("  lifted power").split()) == 1

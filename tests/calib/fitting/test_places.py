@@ -10,6 +10,7 @@ import pytest
 from scipy import signal
 
 import calib
+from benchmarks.trajectories import scenario
 from calib.checks.limits import power_levels_db
 from calib.data.ranges import concatenate
 from tests.calib import synthetic
@@ -159,6 +160,15 @@ def test_errors_of_readings_that_last_are_no_difference_of_tags():
         assert named.evidence.startswith("powers of tag 3 (+")
         assert named.p_value is not None
         assert named.p_value < 1e-4
+
+
+@pytest.mark.slow
+def test_differing_powers_are_named_beside_a_fault_that_they_imitate():
+    """Here they also look like a wrong scale of distances, which makes intervals four times as wide."""
+    found = calib.fit(scenario("lasting_reflections/hall.toml", 10_000, 40.0)).findings
+    powers = next(one for one in found if one.fault == "power levels of tags")
+    assert "tags 2 (+3.0 dB), 3 (+1.5 dB), 5 (+3.0 dB)" in powers.evidence
+    assert "scale of true distances" in [one.fault for one in found]
 
 
 # Lengths and powers in other units than metres and dBm: they are not fitted, and the unit is named.
