@@ -94,21 +94,13 @@ def world(sent=NOBODY, read=NOBODY, noise_db=0.0, lasting=None, **more):
     memory = np.exp(-1 / 300)
     steps = np.random.default_rng(lasting).normal(size=(8, len(r) + 3000)) * np.sqrt(1 - memory**2)
     wander_db = 1.5 * (lasting is not None) * signal.lfilter([1], [1, -memory], steps)[:, 3000:]
-    rows = np.arange(len(r))
-    fpp1 = (
-        r.fpp1_dbm
-        + gain(sent, r.initiator)
-        + gain(read, r.target)
-        + noise_db * rng.normal(size=len(r))
-        + wander_db[r.target, rows]
-    )
-    fpp2 = (
-        r.fpp2_dbm
-        + gain(sent, r.target)
-        + gain(read, r.initiator)
-        + noise_db * rng.normal(size=len(r))
-        + wander_db[r.initiator, rows]
-    )
+
+    def readings(power_dbm, sender, reader):
+        noise = noise_db * rng.normal(size=len(r)) + wander_db[reader, np.arange(len(r))]
+        return power_dbm + gain(sent, sender) + gain(read, reader) + noise
+
+    fpp1 = readings(r.fpp1_dbm, r.initiator, r.target)
+    fpp2 = readings(r.fpp2_dbm, r.target, r.initiator)
     return replace(r, fpp1_dbm=fpp1, fpp2_dbm=fpp2)
 
 
