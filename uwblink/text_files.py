@@ -100,10 +100,10 @@ class TomlReader:
         return list(found)
 
     def choice(self, key: str, value: Any, allowed: Iterable[Any]) -> Any:
-        """Return a value that is one of `allowed`; None among them allows a missing key."""
+        """Return a value that is one of `allowed`; None or "" among them allows a missing key."""
         listed = list(allowed)
         if not any(type(value) is type(one) and value == one for one in listed):
-            names = ", ".join(str(a) for a in listed if a is not None)
+            names = ", ".join(str(a) for a in listed if a not in (None, ""))
             raise self.error(f"{self.path}: {key}: found {value!r}, allowed: {names}")
         return value
 

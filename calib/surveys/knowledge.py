@@ -112,7 +112,7 @@ def load_knowledge(path: str | os.PathLike[str]) -> Knowledge:
     `name`, and any of `known`, `order = [3, 1, 2]`, `start_s` and `end_s`. A distance has `between = [1, 2]`,
     `distance_m`, and any of `sigma_m` and `arrangement`; a position `tag`, `position_m`, and any of the same two.
     """
-    file = TomlReader(Path(path), BadInputError, "file of what is known")
+    file = TomlReader(Path(path), BadInputError, "file of known facts (.toml; or give line or plane)")
     file.known(file.table, ("known", *KEYS))
     arrangements = list(_rows(file, "arrangements"))
     names = [row["name"] for row in arrangements]

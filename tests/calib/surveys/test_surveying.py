@@ -338,6 +338,7 @@ def test_a_known_delay_stays_and_the_others_follow():
         ("[[arrangements]]\nname = 'a'\norder = [3, 1]\nknown = 'plane'", 'known = "line"'),
         ("distances = 3", "distances"),
         ("known = ", "not valid TOML"),
+        ("known = 3", "known: found 3, allowed: line, plane$"),
     ],
 )
 def test_errors_in_files_of_known_facts_are_one_line(tmp_path, text, message):
@@ -352,7 +353,7 @@ def test_errors_in_files_of_known_facts_are_one_line(tmp_path, text, message):
     ("settings", "message"),
     [
         ({"known": 3}, "known"),
-        ({"known": "nowhere.toml"}, "no such file of what is known"),
+        ({"known": "nowhere.toml"}, "no such file of known facts"),
         ({"known": calib.Knowledge(shape="ring")}, "ring"),
         ({"known": calib.Knowledge(shapes={"9": "line"})}, "contains an unknown arrangement '9'"),
         ({"known": calib.Knowledge(distances=(KnownDistance(1, 9, 1.0, 0.1),))}, "have no ranges"),
