@@ -53,9 +53,9 @@ def pose_clock(view: RecordingView) -> Iterator[Candidate]:
         offset_ns = find_offset(view.exchanges, view.poses, view.tags, within_s=3.0)
     except ImportTableError:
         return
-    shift_s, e = offset_ns * 1e-9, view.exchanges
+    shift_s, e = offset_ns * 1e-9, view.ranges
     if abs(shift_s) > CLOCKS_S:
-        moved = distances_m(view.poses, view.tags, e.initiator, e.target, e.time_ns - offset_ns)
+        moved = distances_m(view.poses, view.tags, e.initiator, e.target, e.valid_ns - offset_ns)
         evidence = f"with the poses {shift_s:+.3f} s later"
         yield _with_spreads(view, Candidate("pose time offset", evidence, words={"shift": f"{shift_s:.3f}"}), moved)
 
@@ -64,13 +64,13 @@ def frozen_poses(view: RecordingView) -> Iterator[Candidate]:
     """Find times at which motion capture lost a moving body and repeated its last pose."""
     if not view.posed:
         return
-    e, poses = view.exchanges, view.poses[np.lexsort((view.poses.time_ns, view.poses.body))]
+    e, poses = view.ranges, view.poses[np.lexsort((view.poses.time_ns, view.poses.body))]
     columns = np.column_stack([poses.position_m, poses.quaternion])
     repeated = (columns[1:] == columns[:-1]).all(axis=1) & (poses.body[1:] == poses.body[:-1])
     # Without repeated poses there is a gap, in which the places of antennas are not known.
     fresh = poses[~np.append(False, repeated)]
     ends, error_m = np.stack([e.initiator, e.target], axis=1), view.less_pairs(view.ranges.error_m)
-    lost = np.stack([np.isnan(antennas_m(fresh, view.tags, ids, e.time_ns)[:, 0]) for ids in ends.T], axis=1)
+    lost = np.stack([np.isnan(antennas_m(fresh, view.tags, ids, e.valid_ns)[:, 0]) for ids in ends.T], axis=1)
     lost &= np.isfinite(error_m)[:, None]
     rows = np.flatnonzero(lost.any(axis=1))
     rows = rows[np.argsort(e.time_ns[rows], kind="stable")]
@@ -117,8 +117,8 @@ def _displacements(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list
     """
     if (fit := view.quick_fit) is None:
         return
-    e, standing = view.exchanges[fit.rows], places_m(view)
-    away_m, ways = sights(view.poses, view.tags, e.initiator, e.target, e.time_ns)
+    e, standing = view.ranges[fit.rows], places_m(view)
+    away_m, ways = sights(view.poses, view.tags, e.initiator, e.target, e.valid_ns)
     arms = {f"tag {tag.tag}": tag for tag in view.tags if tag.body not in standing}
     ends = {name: np.stack([e.initiator == tag.tag, e.target == tag.tag], axis=1) for name, tag in arms.items()}
     sides = {name: -away_m[:, None] * np.where(own[..., None], ways, 0.0).sum(axis=1) for name, own in ends.items()}
@@ -152,12 +152,12 @@ def _turns(view: RecordingView) -> Iterator[tuple[Candidate, Poses, list[Tag]]]:
     if (fit := view.quick_fit) is None:
         return
     every = slice(None, None, max(len(fit.rows) // 1000, 1))
-    e, pair = view.exchanges[fit.rows[every]], fit.model.pairs.number[every]
+    e, pair = view.ranges[fit.rows[every]], fit.model.pairs.number[every]
     ends, arms = np.stack([e.initiator, e.target], axis=1), {tag.tag: np.array(tag.lever_arm_m) for tag in view.tags}
     arm = np.array([[arms[tag] for tag in both] for both in ends.tolist()])
     # Antennas without lever arms, and with lever arms of a metre along the axes of their bodies.
     told = [_with_arms(view.tags, dict.fromkeys(arms, tip)) for tip in np.eye(4, 3, -1)]
-    place, *tips = (np.stack([antennas_m(view.poses, tags, ids, e.time_ns) for ids in ends.T], 1) for tags in told)
+    place, *tips = (np.stack([antennas_m(view.poses, tags, ids, e.valid_ns) for ids in ends.T], 1) for tags in told)
     axes = np.stack(tips, axis=-1) - place[..., None]
     # Rotations that turn axes into each other: searches for any turn begin at the best.
     turns = [*Rotation.create_group("O").as_rotvec()]
@@ -218,10 +218,10 @@ def geometry(view: RecordingView) -> Iterator[Candidate]:
     A fault with fitted unknowns must explain a twentieth more than one without, which may be a case of it.
     """
     weighted = ((_trials, 1.0), (_displacements, 0.95), (_turns, 0.95)) if view.posed else ()
-    trials, e = [(weight, *one) for suspected, weight in weighted for one in suspected(view)], view.exchanges
+    trials, e = [(weight, *one) for suspected, weight in weighted for one in suspected(view)], view.ranges
     found = []
     for weight, seen, poses, tags in trials:
-        true_m = distances_m(poses, tags, e.initiator, e.target, e.time_ns)
+        true_m = distances_m(poses, tags, e.initiator, e.target, e.valid_ns)
         tested = _with_spreads(view, seen, true_m, tried=len(trials))
         found.append(replace(tested, gain=weight * tested.gain))
     if sure := [one for one in found if one.p_value < BUDGET]:
@@ -237,7 +237,7 @@ def _with_spreads(view: RecordingView, seen: Candidate, truth_m: Floats, *, trie
     before, after = (view.less_pairs(view.ranges.raw_m - true) for true in (view.ranges.truth_m, truth_m))
     known = np.isfinite(before) & np.isfinite(after)
     rows = np.flatnonzero(known & (np.abs(view.ranges.truth_m - truth_m) > 1e-3))
-    rows = rows[np.argsort(view.exchanges.time_ns[rows], kind="stable")]
+    rows = rows[np.argsort(view.ranges.time_ns[rows], kind="stable")]
     # A tag that ranges with two others has at least 80 ranges in a quick fit: eight stretches of ten.
     cuts = [rows[cut] for cut in stretches(len(rows), fewest=10)]
     if not cuts:
@@ -291,8 +291,8 @@ def anchors(view: RecordingView) -> Iterator[Candidate]:
 
 def _with_truth(view: RecordingView, **changes: Any) -> RecordingView:
     """Return a view with other poses or tags, and true distances by them."""
-    changed, e = replace(view, **changes), view.exchanges
-    truth_m = distances_m(changed.poses, changed.tags, e.initiator, e.target, e.time_ns)
+    changed, e = replace(view, **changes), view.ranges
+    truth_m = distances_m(changed.poses, changed.tags, e.initiator, e.target, e.valid_ns)
     return replace(changed, ranges=replace(view.ranges, truth_m=truth_m))
 
 
@@ -424,8 +424,8 @@ def _vectors_to_bodies(view: RecordingView, fit: QuickFit, bodies: Iterable[str]
     Bodies with fewer than 200 ranges are left out: in 32 stretches of time each slope would be a sum over few ranges,
     and far from normal.
     """
-    e, found = view.exchanges[fit.rows], dict[str, Floats]()
-    here, there = (antennas_m(view.poses, view.tags, ids, e.time_ns) for ids in (e.initiator, e.target))
+    e, found = view.ranges[fit.rows], dict[str, Floats]()
+    here, there = (antennas_m(view.poses, view.tags, ids, e.valid_ns) for ids in (e.initiator, e.target))
     for body in bodies:
         tags = [tag.tag for tag in view.tags if tag.body == body]
         sign = np.isin(e.initiator, tags).astype(float) - np.isin(e.target, tags)

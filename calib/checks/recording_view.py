@@ -34,7 +34,7 @@ from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.recording.summary import differences, repeated_rows, single_reports
-from uwblink.twr import Exchanges
+from uwblink.twr import Exchanges, range_ns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +100,7 @@ def view_of(name: str, source: Source) -> RecordingView:
     e = reports.exchanges
     truth_m, posed = e.truth_m, False
     if len(part.poses):
-        by_poses = distances_m(part.poses, part.tags, e.initiator, e.target, e.time_ns)
+        by_poses = distances_m(part.poses, part.tags, e.initiator, e.target, range_ns(e))
         given = np.isfinite(truth_m)
         # Tables with places of antennas have both, which are then equal.
         apart = np.abs(truth_m - by_poses)[given & np.isfinite(by_poses)]

@@ -78,7 +78,8 @@ class Ranges(ColumnTable):
     initiator and target to each other, in the frames of their bodies, NaN if attitudes are unknown; `turning` are the
     tags on bodies that turn. `temperature_c` (n, 2) are the temperatures of initiator and target, NaN without a reading
     near in time; `features` (n, 2) are the `FEATURES` of their receptions, NaN if unknown. `supply_v_per_k` is the
-    change of a tag's supply voltage per kelvin, for tags that measure both.
+    change of a tag's supply voltage per kelvin, for tags that measure both. `time_ns` is the time of an exchange, and
+    `valid_ns` the time at which a changing distance equals its range (`uwblink.twr.range_ns`), by default the same.
 
     A row with a `listener` (-1 in others) is a difference of arrival without stamps: the listener's distance to the
     target minus its distance to the initiator. The weight of its initiator is negative.
@@ -111,9 +112,12 @@ class Ranges(ColumnTable):
     supply_v_per_k: tuple[tuple[int, float], ...] = ()
     features: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, len(FEATURES)), dtype=np.float32))
     listener: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    valid_ns: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
-        """Fill missing columns: one session, no listeners, unknown directions, temperatures and features."""
+        """Fill missing columns: times of exchanges, one session, no listeners, and NaN for what is unknown."""
+        if len(self.valid_ns) != len(self.time_ns):
+            object.__setattr__(self, "valid_ns", self.time_ns)
         if len(self.listener) != len(self.time_ns):
             object.__setattr__(self, "listener", np.full(len(self.time_ns), -1))
         if len(self.session) != len(self.time_ns):
@@ -145,9 +149,10 @@ class Ranges(ColumnTable):
         if truth.shape != (len(exchanges),):
             raise BadInputError(f"has shape {truth.shape}, expected ({len(exchanges)},)", parameter="truth_m")
         seen: dict[str, Any] = {}
+        valid_ns = range_ns(exchanges)
         if poses is not None and len(poses):
             tracks = tracks_of(poses)
-            distance, toward = sights(tracks, tags, exchanges.initiator, exchanges.target, range_ns(exchanges))
+            distance, toward = sights(tracks, tags, exchanges.initiator, exchanges.target, valid_ns)
             truth = np.where(np.isfinite(truth), truth, distance)
             # Tables of positions have no attitudes: all of their poses have (0, 0, 0, 1), which are no directions.
             placed = [tag for tag in tags if tag.body in tracks and not any(tag.lever_arm_m)]
@@ -179,6 +184,7 @@ class Ranges(ColumnTable):
             clocks_apart=clocks_apart(exchanges),
             bodies=tuple((tag.tag, tag.body) for tag in tags),
             antenna_delays=antenna_delays or {},
+            valid_ns=valid_ns,
             **seen,
         )
 
@@ -351,8 +357,8 @@ class Ranges(ColumnTable):
         return found if self.arrivals is None else replace(found, arrivals=self.arrivals.of_exchanges(rows, len(self)))
 
     def to_dict(self) -> dict[str, NDArray[Any]]:
-        """Return the columns (n,) by name, without directions, temperatures, features and listeners."""
-        hidden = ("toward", "temperature_c", "features", "listener")
+        """Return the columns (n,) by name, without directions, temperatures, features, listeners and `valid_ns`."""
+        hidden = ("toward", "temperature_c", "features", "listener", "valid_ns")
         return {name: column for name, column in self._columns().items() if name not in hidden}
 
     def _title(self) -> str:

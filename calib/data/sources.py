@@ -225,11 +225,6 @@ def antenna_delays_in(meta: Mapping[str, Any], source: str) -> AntennaDelays:
         raise BadInputError(f"{source}: {error}") from error
 
 
-def antenna_delays_of(source: Source, name: str) -> AntennaDelays:
-    """Return the antenna delays programmed into the tags of a source; raises the errors of `antenna_delays_in`."""
-    return antenna_delays_in(getattr(source, "meta", None) or {}, name)
-
-
 def planted_of(source: Source, name: str) -> Mapping[str, Any] | None:
     """Return the planted parameters of a simulation, None without any; raises the errors of `check_planted`."""
     found = getattr(source, "planted", None) or getattr(source, "meta", {}).get("planted")
@@ -338,6 +333,37 @@ def require_arrivals(ranges: Ranges) -> None:
         )
 
 
+def ranges_of(source: Source, name: str, *, truth: bool = True) -> tuple[Exchanges, Ranges]:
+    """Return the exchanges of a source, and a range for each, with all that the source knows of it.
+
+    If both ends reported an exchange, one report is used. With `truth` False, true distances and poses are not used:
+    distances and directions are NaN. Raises `BadInputError` if planted values or antenna delays have a wrong form.
+    """
+    exchanges, warm = single_reports(source.exchanges).exchanges, getattr(source, "temperature", None)
+    found = Ranges.from_exchanges(
+        exchanges,
+        None if truth else np.full(len(exchanges), np.nan),
+        poses=source.poses if truth else None,
+        tags=source.tags,
+        planted=planted_of(source, name),
+        source=name,
+        antenna_delays=antenna_delays_in(getattr(source, "meta", None) or {}, name),
+        temperature=warm,
+    )
+    celsius = found.temperature_c[np.isfinite(found.temperature_c)]
+    if len(found) and warm and len(warm["tag"]) and not len(celsius):
+        text = f"{name}: no temperatures of ranging tags within 30 s of their ranges: they are not used"
+        warn(text, TemperatureWarning)
+    # Boards in rooms are colder than 45 °C. If all readings are above 45, they are probably in °F (45 °F are 7 °C).
+    if len(celsius) and celsius.min() > 45:
+        read = f"{name}: temperatures are {celsius.min():.0f} to {celsius.max():.0f} °C"
+        text = f"{read}; if they are degrees Fahrenheit, import them again as (F - 32) / 1.8"
+        warn(text, TemperatureWarning)
+    bare = getattr(source, "differences", None) or {"difference_m": np.zeros(0)}
+    fingerprint = fingerprint_of(exchanges, bare["difference_m"])
+    return exchanges, replace(found, features=features_of(exchanges, source), recordings=((name, fingerprint),))
+
+
 def load_flight(
     data: Data,
     *,
@@ -356,40 +382,19 @@ def load_flight(
     `UnanswerableError` if no range is usable.
     """
     with opened(data) as (name, source):
-        exchanges, warm = single_reports(source.exchanges).exchanges, getattr(source, "temperature", None)
-        found = Ranges.from_exchanges(
-            exchanges,
-            poses=source.poses,
-            tags=source.tags,
-            planted=planted_of(source, name),
-            source=name,
-            antenna_delays=antenna_delays_of(source, name),
-            temperature=warm,
-        )
-        if len(found) and warm and len(warm["tag"]) and not np.isfinite(found.temperature_c).any():
-            text = f"{name}: no temperatures of ranging tags within 30 s of their ranges: they are not used"
-            warn(text, TemperatureWarning)
-        celsius = found.temperature_c[np.isfinite(found.temperature_c)]
-        # Boards in rooms are colder than 45 °C. If all readings are above 45, they are probably in °F (45 °F are 7 °C).
-        if len(celsius) and celsius.min() > 45:
-            read = f"{name}: temperatures are {celsius.min():.0f} to {celsius.max():.0f} °C"
-            text = f"{read}; if they are degrees Fahrenheit, import them again as (F - 32) / 1.8"
-            warn(text, TemperatureWarning)
-        found = replace(found, features=features_of(exchanges, source))
+        exchanges, found = ranges_of(source, name)
         heard = getattr(source, "overheard", None)
         if heard and len(heard["time_ns"]):
             arrivals = arrivals_of(exchanges, found.raw_m, heard, source.poses, source.tags, need_truth=need_truth)
             powered = np.isfinite(measured_powers(arrivals.poll_dbm) + measured_powers(arrivals.response_dbm))
             found = replace(found, arrivals=arrivals[powered | (not need_power)])
-        bare = dict(getattr(source, "differences", None) or {})
-        count = len(bare.get("time_ns", ()))
-        if count:
+        bare = getattr(source, "differences", None)
+        if bare and len(bare["time_ns"]):
             found = _with_differences(found, bare, source, need_power=need_power, use=use)
-        fingerprint = fingerprint_of(exchanges, *([bare["difference_m"]] if count else []))
         reasons = _why_no_truth(source), _why_no_power(exchanges)
         usable = found.usable(*reasons, need_power=need_power, need_truth=need_truth)
         tables = {table: dict(getattr(source, table, None) or {}) for table in sensors}
-        return Flight(replace(usable, recordings=((name, fingerprint),)), source.poses, list(source.tags), tables)
+        return Flight(usable, source.poses, list(source.tags), tables)
 
 
 def _with_differences(

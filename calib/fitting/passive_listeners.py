@@ -4,19 +4,16 @@ it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from calib.calibration.applying import heard_receptions, reception_bias_m
 from calib.calibration.model import Calibration
-from calib.data.arrivals import arrivals_of
 from calib.data.ranges import Ranges
-from calib.data.sources import Data, opened
 from calib.estimator.grouped_errors import fit_grouped_errors
 from calib.estimator.range_model import METRES_A_NS
-from uwblink.recording.summary import single_reports
 
 MIN_OF_DELAY: Final = 50
 """Ranges or receptions for the delay of one tag: their mean is known to a seventh of the noise, 0.03 ns."""
@@ -31,19 +28,15 @@ class OverheardDelay:
     count: int
 
 
-def heard_delays(data: Data, calibration: Calibration) -> dict[int, OverheardDelay]:
-    """Return delays by tag from the overheard exchanges of a recording; empty where it has none, or no true distances.
+def heard_delays(ranges: Ranges, calibration: Calibration) -> dict[int, OverheardDelay]:
+    """Return delays by tag from the arrivals of ranges; empty if there are none.
 
     The bias curve of the calibration corrects each of the three receptions (`calib.data.arrivals`).
     """
-    with opened(data) as (name, source):
-        heard = getattr(source, "overheard", None)
-        if not heard or not len(heard["time_ns"]) or not len(source.poses):
-            return {}
-        exchanges, poses, tags = single_reports(source.exchanges).exchanges, source.poses, list(source.tags)
-    ranges = Ranges.from_exchanges(exchanges, poses=poses, tags=tags, source=name)
-    arrivals = arrivals_of(exchanges, ranges.raw_m, heard, poses, tags)
-    bias_m = reception_bias_m(calibration, heard_receptions(replace(ranges, arrivals=arrivals)))
+    arrivals = ranges.arrivals
+    if arrivals is None:
+        return {}
+    bias_m = reception_bias_m(calibration, heard_receptions(ranges))
     target, of_range = ranges.target[arrivals.exchange], ranges.error_m[arrivals.exchange]
     error_m = arrivals.error_m + of_range - bias_m
     found = {}

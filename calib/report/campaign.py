@@ -261,15 +261,13 @@ def run_campaign(
         findings = [finding for one in (*recordings, *judged) for finding in _findings(one)]
         progress("localizing")
         progress(0.2)
-        whole = [data for data in recordings if not isinstance(data, Ranges)]
         return Campaign(
             calibration=known,
             training=fitted,
             tests=testing if held is None else [held.ranges],
             part=None if held is None else held.calibration,
             fit=found,
-            # Of the first recording with passive listeners.
-            heard=next(filter(None, (heard_delays(data, known) for data in whole)), {}),
+            heard=heard_delays(ranges, known),
             findings=findings,
             tracks=[track for data in judged or recordings for track in _tracks(data, known)],
             origin=origin_of([*given[0], *given[1]], command),

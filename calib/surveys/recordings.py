@@ -16,7 +16,7 @@ from scipy import ndimage, special
 
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.data.ranges import Ranges, concatenate
-from calib.data.sources import Data, antenna_delays_of, each, fingerprint_of, opened, refuse_repeated
+from calib.data.sources import Data, each, opened, ranges_of, refuse_repeated
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.optimize import LONGER, maximize
 from calib.estimator.range_model import RangeModel
@@ -30,7 +30,6 @@ from calib.surveys.knowledge import Knowledge
 from uwblink.arrays import ColumnTable, Floats, Ints
 from uwblink.recording.antenna_delays import AntennaDelays
 from uwblink.recording.schema import Arrangement, KnownDistance
-from uwblink.recording.summary import single_reports
 from uwblink.ticks import METRES_PER_TICK
 
 LIFT = "mean-of-lifted"
@@ -119,14 +118,11 @@ def _load(data: Data) -> tuple[Ranges, list[Arrangement], list[KnownDistance]]:
     """Return the possible ranges of a recording, without true distances, and its other contents."""
     if isinstance(data, Ranges):
         # Parts of one recording have the same fingerprint.
-        return replace(data, truth_m=np.zeros(len(data)), recordings=()).usable(need_power=False), [], []
+        return replace(data, recordings=()).usable(need_power=False, need_truth=False), [], []
     with opened(data) as (name, source):
-        exchanges = single_reports(source.exchanges).exchanges
-        delays, truth = antenna_delays_of(source, name), np.zeros(len(exchanges))
-        ranges = Ranges.from_exchanges(exchanges, truth, source=name, antenna_delays=delays)
-        ranges = replace(ranges, recordings=((name, fingerprint_of(exchanges)),))
+        ranges = ranges_of(source, name, truth=False)[1].usable(need_power=False, need_truth=False)
         marked, stated = getattr(source, "arrangements", ()), getattr(source, "known_distances", ())
-        return ranges.usable(need_power=False), list(marked), list(stated)
+        return ranges, list(marked), list(stated)
 
 
 def _arrangements(

@@ -129,10 +129,8 @@ def _settings(
 
 def range_model(scene: Scene, settings: FitSettings, *, curve: bool, offsets: bool = True) -> tuple[RangeModel, Scene]:
     """Return the model of delays, curves and offsets, and the scene with the ranges that the model keeps."""
-    # True distances are unknown. The row numbers in their place tell which rows the model keeps.
-    numbered = replace(scene.ranges, truth_m=np.arange(len(scene.ranges), dtype=np.float64))
-    model = model_of(numbered, replace(settings, delays_only=not curve), offsets=offsets)
-    return model, scene.only(model.ranges.truth_m.astype(np.int64))
+    model = model_of(scene.ranges, replace(settings, delays_only=not curve), offsets=offsets)
+    return model, replace(scene, ranges=model.ranges)
 
 
 def _fit_to_estimated_distances(model: RangeModel, top: Search, known: Calibration | None) -> RangeFit:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.data.ranges import Ranges
-from calib.data.sources import Data, antenna_delays_of, opened, planted_of
+from calib.data.sources import Data, opened, ranges_of
 from calib.errors import UnanswerableError
 from calib.settings import FlightSettings
 from calib.trajectories.samples import (
@@ -27,13 +27,11 @@ from calib.trajectories.samples import (
 )
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses
-from uwblink.recording.summary import single_reports
-from uwblink.twr import range_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """Ranges (n,) at `time_s` (n,) between tags of bodies that move or stand.
+    """Ranges (n,) in order of time between tags of bodies that move or stand; time zero is `began_ns`.
 
     `moving` names the moving bodies. `still` gives the position of each standing body, None if it is estimated. `arms`
     gives the body and the lever arm of each tag: of moving bodies in the body's axes, of standing ones in the world's.
@@ -43,7 +41,7 @@ class Scene:
 
     source: str
     ranges: Ranges
-    time_s: Floats
+    began_ns: int
     moving: tuple[str, ...]
     still: Mapping[str, Floats | None]
     arms: Mapping[int, tuple[str, Floats]]
@@ -52,6 +50,11 @@ class Scene:
     inertial: Mapping[str, Inertial]
     heights: Heights
     tapes: Tapes
+
+    @property
+    def time_s(self) -> Floats:
+        """The times (n,) of the ranges in seconds."""
+        return _seconds(self.ranges.valid_ns, self.began_ns)
 
     @property
     def sought(self) -> list[str]:
@@ -78,11 +81,11 @@ class Scene:
 
     def only(self, rows: Ints) -> Scene:
         """Return the scene with some of its ranges."""
-        return replace(self, ranges=self.ranges[rows], time_s=self.time_s[rows])
+        return replace(self, ranges=self.ranges[rows])
 
     def thinned(self, count: int) -> Scene:
         """Return the scene with about `count` of its ranges, evenly spread."""
-        return self.only(np.arange(0, len(self.time_s), max(len(self.time_s) // count, 1)))
+        return self.only(np.arange(0, len(self.ranges), max(len(self.ranges) // count, 1)))
 
 
 POSE_STD_M = 0.02
@@ -98,29 +101,19 @@ root second): judgements for an autopilot. Half or twice of the first moves dela
 def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True) -> Scene:
     """Return the scene of a recording; raises `UnanswerableError` if it has no ranges or no body moves."""
     with opened(data) as (name, source):
-        exchanges = single_reports(source.exchanges).exchanges
+        ranges = ranges_of(source, name, truth=False)[1]
         poses, tags = source.poses, list(source.tags)
-        planted, delays = planted_of(source, name), antenna_delays_of(source, name)
         # A source may lack any of these.
         imu, height = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
         stated, arrangements = (tuple(getattr(source, one, ())) for one in ("known_distances", "arrangements"))
     if not tags:
         raise UnanswerableError(f"{name}: contains no bodies of tags; add them with 'uwblink poses --tags'")
-    # True distances are unknown. The times of ranges are in their place.
-    ranges = Ranges.from_exchanges(
-        exchanges,
-        np.asarray(range_ns(exchanges) * 1e-9, dtype=np.float64),
-        tags=tags,
-        planted=planted,
-        source=name,
-        antenna_delays=delays,
-    ).usable(need_power=need_power)
+    ranges = ranges.usable(need_power=need_power, need_truth=False)
     carried = [tag.tag for tag in tags]
     ranges = ranges[np.isin(ranges.initiator, carried) & np.isin(ranges.target, carried)].in_time_order()
     if not len(ranges):
         raise UnanswerableError(f"{name}: no ranges between tags whose bodies are known")
     began = int(ranges.time_ns[0])
-    time = ranges.truth_m - began * 1e-9
     ranging = set(ranges.tags())
     arms = {tag.tag: (tag.body, np.array(tag.lever_arm_m)) for tag in tags if tag.tag in ranging}
     bodies = sorted({body for body, _ in arms.values()})
@@ -140,7 +133,7 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     for tag, (body, arm) in arms.items():
         if body in still and len(turned[body]):
             arms[tag] = body, Rotation.from_quat(turned[body].quaternion[0]).apply(arm)
-    last = float(time[-1])
+    last = float(_seconds(ranges.valid_ns[-1:], began)[0])
     until = last if settings.poses_until_s is None else min(settings.poses_until_s, last)
     sensed = {body: Readings.of(imu, body, began) for body in moving}
     found = {body: _attitude(body, turned[body], began, sensed[body], settings, name) for body in moving}
@@ -150,8 +143,8 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     }
     return Scene(
         source=ranges.source,
-        ranges=replace(ranges, truth_m=np.full(len(time), np.nan)),
-        time_s=time,
+        ranges=ranges,
+        began_ns=began,
         moving=moving,
         still=still if settings.anchors == "given" else dict.fromkeys(still),
         arms=arms,
@@ -170,16 +163,16 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     )
 
 
-def _seconds(track: Poses, began_ns: int) -> Floats:
-    """Return the times of poses in seconds since the first range."""
-    return np.asarray((track.time_ns - began_ns) * 1e-9, dtype=np.float64)
+def _seconds(time_ns: Ints, began_ns: int) -> Floats:
+    """Return times (n,) in seconds since the first range."""
+    return np.asarray((time_ns - began_ns) * 1e-9, dtype=np.float64)
 
 
 def _places(tracks: Sequence[Poses], began_ns: int, until_s: float) -> Places:
     """Return the positions of each body since the first range, `SAMPLE_S` apart."""
     parts = []
     for number, track in enumerate(tracks):
-        time_s = _seconds(track, began_ns)
+        time_s = _seconds(track.time_ns, began_ns)
         early = np.flatnonzero((time_s >= 0) & (time_s < until_s))
         rows = early[np.diff(np.floor(time_s[early] / SAMPLE_S), prepend=-np.inf) > 0]
         parts.append((time_s[rows], np.full(len(rows), number), track.position_m[rows], np.full(len(rows), POSE_STD_M)))
@@ -194,7 +187,7 @@ def _attitude(
     wander = np.radians([TILT_WANDER_DEG, TILT_WANDER_DEG, HEADING_WANDER_DEG])
     if settings.heading_std_deg == 0:
         std, wander = np.zeros((2, 3))
-    time_s = _seconds(track, began_ns)
+    time_s = _seconds(track.time_ns, began_ns)
     given = Attitude(time_s=time_s, quaternion=track.quaternion, std_rad=std, wander_rad=wander)
     if settings.attitudes != "imu":
         return given if settings.attitudes == "poses" and len(track) else None

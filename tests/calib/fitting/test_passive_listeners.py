@@ -26,7 +26,7 @@ NOTHING = calibration(dict.fromkeys(range(1, 7), 0.0), 0.1)
 def test_without_noise_listeners_give_the_planted_delays(tmp_path):
     path = recorded(tmp_path, "noiseless.toml", "run.duration_s=20", *PASSIVE)
     planted = load_ranges(path).planted["delays_ns"]
-    heard = heard_delays(path, NOTHING)
+    heard = heard_delays(load_ranges(path), NOTHING)
     assert len(heard) >= 3
     for tag, found in heard.items():
         # Stamps are whole ticks of 15.6 ps, five of them; hundreds of exchanges average them to less than a picosecond,
@@ -37,9 +37,10 @@ def test_without_noise_listeners_give_the_planted_delays(tmp_path):
 @pytest.mark.slow
 def test_listeners_agree_with_the_fit_of_a_noisy_flight(tmp_path):
     path = recorded(tmp_path, "icra2023/train.toml", "run.duration_s=60", *PASSIVE)
-    found = fit(load_ranges(path)).calibration
-    heard = heard_delays(path, found)
-    assert (heard_delays(uwblink.load(path), found), len(heard)) == (heard, 4)
+    ranges = load_ranges(path)
+    found = fit(ranges).calibration
+    heard = heard_delays(ranges, found)
+    assert (heard_delays(load_ranges(uwblink.load(path)), found), len(heard)) == (heard, 4)
     # Both have the constant of the curve in the same gauge. A fit of 60 s determines a delay to 17 ps, listeners to 8
     # ps.
     for tag, one in heard.items():
@@ -47,4 +48,4 @@ def test_listeners_agree_with_the_fit_of_a_noisy_flight(tmp_path):
 
 
 def test_without_listeners_there_are_no_delays(tmp_path):
-    assert heard_delays(recorded(tmp_path, "icra2023/train.toml", "run.duration_s=5"), NOTHING) == {}
+    assert heard_delays(load_ranges(recorded(tmp_path, "icra2023/train.toml", "run.duration_s=5")), NOTHING) == {}

@@ -178,6 +178,20 @@ def test_responses_belong_to_the_exchange_before_them(tmp_path, rows, expected):
 
 
 @pytest.mark.slow
+def test_fits_without_true_distances_use_features():
+    flight, rng = calib.sample_flight(600), np.random.default_rng(75)
+    e, late = flight.exchanges, rng.uniform(size=600) < 0.2
+    longer = (e.rx2 + np.rint(late * rng.exponential(1.0, 600) / (0.299702547 * 15.65e-3 / 2))).astype(np.int64)
+    taps = {slow: tuple(response(5 if slow else 1)) for slow in (False, True)}
+    rows = zip(e.time_ns.tolist(), e.initiator.tolist(), e.target.tolist(), late.tolist(), strict=True)
+    cirs = [CirRow(time_ns, i, i, j, 740.3, taps[slow]) for time_ns, i, j, slow in rows]
+    heard = replace(flight, exchanges=replace(e, rx2=longer), cirs=cirs)
+    slope = calib.fit_from_ranges(heard, poses_until_s=3.0).calibration.errors.features["rise_taps"].log_odds
+    # Of ranges that rise in 6 instead of 2 taps all are long, of the others none: the prior limits the slope.
+    assert slope > 0.5
+
+
+@pytest.mark.slow
 def test_from_a_recording_to_corrected_ranges(tmp_path):
     flight, known = tmp_path / "f.uwb", tmp_path / "c.json"
     simulate(room(305, 20.0), contention=False).save(flight)
