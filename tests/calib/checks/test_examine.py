@@ -373,6 +373,17 @@ def test_positions_that_contradict_true_distances_are_named():
     assert found.evidence.startswith("by the poses, tag 101 is at the given position of 103")
 
 
+def test_true_distances_of_the_poses_hold_in_the_middle_of_long_exchanges():
+    flight, reply = fly(replace(RIG, seconds=60), 97), 50e-3 / 15.65e-12
+    e = flight.exchanges
+    # Within 25 ms distances change by centimetres.
+    columns = {"protocol": np.full(len(e), "ss"), "tx2": e.tx2 + int(reply), "rx2": e.rx2 + int(reply)}
+    wrong = planted.exchanged_anchors(planted.changed(flight, **columns), RNG(5), given=False)
+    truth_m = calib.Ranges.from_exchanges(wrong.exchanges, poses=wrong.poses, tags=wrong.tags).truth_m
+    found = only(planted.changed(wrong, truth_m=truth_m), "anchor stands elsewhere")
+    assert found.evidence.startswith("ranges with anchor1 fit a position")  # not "by the poses, ..."
+
+
 def test_true_distances_of_a_displaced_anchor_are_named():
     flight = fly(replace(RIG, seconds=60), 97)
     wrong = with_places(flight, {"anchor2": [3.0, -4.0, 1.0]})
