@@ -13,6 +13,7 @@ import pytest
 import calib
 import uwblink
 from tests.processes import refuse, succeed
+from tests.registered import registered
 from uwblink.boards import DIALECTS, Dialect, LivePage, PrintedRange, dialect_of, load_correction
 from uwblink.boards.dialects import Printed
 from uwblink.boards.ports import Terminal
@@ -182,19 +183,14 @@ def test_dialects_come_by_entry_points_and_words_get_ids():
         cells = (line.partition("=") for line in lines)
         return [PrintedRange(to_id=who, range_m=float(far)) for who, _, far in cells if far]
 
-    DIALECTS.register(Dialect("mine", "A form of my own.", parse))
-    try:
-        with printing("alpha=1.0\nbeta=2.0\nbad line\n") as port:
-            seen = Printed()
-            batches = uwblink.boards.printed_ranges([port], dialect_of("mine"), ids=[1], duration_s=1.0, seen=seen)
-            found = [turn for turns in batches for turn in turns]
-        # Words have ids after that of the board, in the order of their appearance.
-        assert sorted(seen.numbers.values()) == [1, 2, 3]
-        named = {number: name for name, number in seen.numbers.items()}
-        told = {(named[turn.pair[1]], turn.report.range_m) for turn in found}
-        assert told == {("alpha", 1.0), ("beta", 2.0)}
-    finally:
-        DIALECTS.remove("mine")
+    mine, seen = Dialect("mine", "A form of my own.", parse), Printed()
+    with registered(DIALECTS, mine), printing("alpha=1.0\nbeta=2.0\nbad line\n") as port:
+        batches = uwblink.boards.printed_ranges([port], dialect_of("mine"), ids=[1], duration_s=1.0, seen=seen)
+        found = [turn for turns in batches for turn in turns]
+    # Words have ids after that of the board, in the order of their appearance.
+    assert sorted(seen.numbers.values()) == [1, 2, 3]
+    named = {number: name for name, number in seen.numbers.items()}
+    assert {(named[turn.pair[1]], turn.report.range_m) for turn in found} == {("alpha", 1.0), ("beta", 2.0)}
     with pytest.raises(ArgumentError, match="parse"):
         DIALECTS.register(Dialect("bad", "No function.", None))  # type: ignore[arg-type]
 
