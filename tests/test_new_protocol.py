@@ -65,8 +65,7 @@ def test_run_show_and_fit(row, tmp_path):
     flown = load(flight)
     assert set(flown.exchanges.protocol.tolist()) == {row.name}
     # The scenario has no bias; 60 s of noiseless stamps leave a picosecond, and a small variation of the spline.
-    found = json.loads(fitted.read_text())["delays_ns"]
-    assert found == pytest.approx(flown.meta["planted"]["delays_ns"], abs=5e-3)
+    assert json.loads(fitted.read_text())["delays_ns"] == pytest.approx(flown.meta["planted"]["delays_ns"], abs=5e-3)
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 without other files, notes on their poses, and exchanges by a map of their fields.
 """
 
-import functools
 import json
 import sqlite3
 from contextlib import closing, suppress
@@ -47,7 +46,6 @@ def truths(count=40):
         yield WHEN + k * 10**7, (4, 9) if k % 2 else (9, 7), [s % 2**40 for s in stamps], flight * TICK_M
 
 
-@functools.cache
 def store_of(kind):
     store = get_typestore(kind)
     for name, text in TYPES.items():
