@@ -1,12 +1,11 @@
 """A protocol registered at run time works with every command, and is exact without noise."""
 
 import json
-import shlex
 
 import numpy as np
 import pytest
 
-from tests import pages
+from tests import pages, processes
 from tests.uwblink.test_register_protocol import SYMMETRIC, TARGETS
 from tests.uwbsim.simulation.test_protocols import bench
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT, load, register_protocol
@@ -20,7 +19,7 @@ SCENARIO = "scenarios/noiseless.toml"
 
 def command(*words):
     """Run a command in this process, which has registered the protocol; return its output."""
-    return pages.command(shlex.join(map(str, words)))
+    return processes.succeed(*words).stdout
 
 
 @pytest.fixture(params=[SYMMETRIC, TARGETS], ids=lambda row: row.name)
