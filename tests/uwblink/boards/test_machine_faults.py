@@ -274,16 +274,16 @@ ZEROS = bytes(4096)
 
 
 class FloodingPort(AnsweringPort):
+    said = 0
+
     def read(self, timeout_s):
         data = super().read(timeout_s) or ZEROS
-        self._ports.said += len(data)
+        FloodingPort.said += len(data)
         return data
 
 
 class Flooding(AnsweringPorts):
     """Ports in virtual time of boards that answer with their ids, and have more zeros whenever they are read."""
-
-    said = 0
 
     def open(self, name):
         return FloodingPort(self, name)
@@ -304,13 +304,13 @@ def test_endless_zeros_are_faults_and_need_no_memory():
     try:
         recorder.run(0.3)
         before, _ = tracemalloc.get_traced_memory()
-        said = ports.said
+        said = FloodingPort.said
         recorder._start_s = ports.now_s()
         recorder.run(0.6)
         after, most = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
     recorder.close()
-    assert ports.said - said > 4e6
+    assert FloodingPort.said - said > 4e6
     assert (most < before + 300_000, after < before + 100_000) == (True, True), (before, most, after)
     assert (seen.faults["garbage"] > 100, len(seen.last_fault) < 300) == (True, True), seen

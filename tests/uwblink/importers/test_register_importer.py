@@ -84,7 +84,7 @@ def test_wrong_importers_are_refused(change, expected):
 
 
 def test_a_reader_must_return_contents(tmp_path):
-    broken = replace(BLANKS, name="broken", read=lambda *_: [1, 2])  # type: ignore[arg-type, return-value]
+    broken = replace(BLANKS, name="broken", read=lambda *_: [1, 2])  # type: ignore[arg-type]
     said = pytest.raises(ArgumentError, match=r"importer 'broken': returned \[1, 2\], expected Contents")
     with registered(IMPORTERS, broken), said:
         import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb")

@@ -219,6 +219,6 @@ def test_predict_and_compare_print_the_fleet(tmp_path, monkeypatch):
     assert "fleet" not in json.loads(processes.succeed("uwbsim", "predict", "--json").stdout)
     with pytest.raises(uwbsim.UwbsimError, match="tags"):
         uwbsim.predict_fleet(uwbsim.State(), 300)
-    words = ("compare", "broadcast", "-o", tmp_path / "c", "--protocols", "ds", "-n", "1000")
-    assert "6 tags" in processes.succeed("uwbsim", *words).stdout
+    compared = ("uwbsim", "compare", "broadcast", "-o", tmp_path / "c", "--protocols", "ds", "-n", "1000")
+    assert "6 tags" in processes.succeed(*compared).stdout
     assert "A fleet of 6 tags" in (tmp_path / "c" / "compare.html").read_text()
