@@ -368,9 +368,10 @@ def test_duckdb_may_open_the_named_file_only(tmp_path):
     write(tmp_path / "t.csv", wrapped(flights()))
     (tmp_path / "secret.csv").write_text("a\n1\n")
     with connected([tmp_path / "t.csv"]) as db:
+        table = SourceTable(db, tmp_path / "t.csv")
         for query in (f"SELECT * FROM read_csv('{tmp_path}/secret.csv')", f"COPY (SELECT 1) TO '{tmp_path}/x.csv'"):
             with pytest.raises(duckdb.Error):
-                SourceTable(db, tmp_path / "t.csv").db.execute(query)
+                table.db.execute(query)
     assert not (tmp_path / "x.csv").exists()
 
 
