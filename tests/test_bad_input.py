@@ -434,7 +434,7 @@ def test_a_folder_with_something_else_in_it_is_not_replaced(seeds, tmp_path):
         succeed(*export.format(f_uwb=seeds / "f.uwb").split(), cwd=tmp_path)
     (tmp_path / "out" / "deep").mkdir()
     (tmp_path / "out" / "deep" / "thesis.txt").write_text("mine")
-    refused(seeds, tmp_path, export, ["out", "deep"])
+    refused(seeds, tmp_path, export, ["out", "contains deep"])
 
 
 def nothing(*names):
