@@ -12,15 +12,14 @@ import io
 import os
 import re
 import shlex
-import sys
 import tomllib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 from unittest.mock import patch
 
+from tests import processes
 from uwblink.pages import figures
 
 ROOT: Final = Path(__file__).parents[1]
@@ -117,17 +116,11 @@ def command(line: str) -> str:
     bare, _, output = line.partition(" > ")
     words = shlex.split(bare)
     assert words[0] in COMMANDS, f"{line}: only {', '.join(COMMANDS)} are run"
-    complaints, status = io.StringIO(), None
-    with told() as printed, contextlib.redirect_stderr(complaints), patch.object(sys, "argv", words):
-        try:
-            import_module(f"{words[0]}.cli").main()
-        except SystemExit as end:
-            status = end.code
-    assert status in (0, None), f"{line}: status {status}\n{printed.getvalue()}{complaints.getvalue()}"
+    with patch.dict(os.environ, COLUMNS="100"):
+        printed = processes.succeed(*words).stdout
     if output:
-        Path(output).write_text(printed.getvalue(), encoding="utf-8")
-        return ""
-    return printed.getvalue()
+        Path(output).write_text(printed, encoding="utf-8")
+    return "" if output else printed
 
 
 @contextlib.contextmanager

@@ -16,9 +16,10 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 import traceback
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -102,6 +103,17 @@ def refuse(*words: object, naming: Iterable[object] = (), status: int = 2, **how
     for text in naming:
         assert str(text) in ended.stderr, ended
     return ended.stderr
+
+
+def wait_until(
+    ready: Callable[[], object], process: subprocess.Popen[Any] | None = None, *, step_s: float = 0.01
+) -> None:
+    """Wait for an effect of another thread, or of a process that goes on; two minutes, because of other load."""
+    end_s = time.monotonic() + 120.0
+    while not ready():
+        assert process is None or process.poll() is None, process.communicate()
+        assert time.monotonic() < end_s
+        time.sleep(step_s)
 
 
 def _work(

@@ -23,8 +23,7 @@ from tests.processes import refuse, run, succeed
 from tests.shared_data import ROOT
 from uwblink import Contents, Exchanges, Poses
 from uwblink.boards.ports import Terminal
-from uwblink.errors import ImportTableError, PortError
-from uwblink.importers.guess import guess_map
+from uwblink.errors import PortError
 from uwbsim.boards.server import Server
 
 NOISELESS = (ROOT / "scenarios" / "noiseless.toml").read_text()
@@ -66,6 +65,7 @@ def seeds(tmp_path_factory):
     (folder / "poses.csv").write_text("time_s,body,x,y,z,qx,qy,qz,qw\n0.0,robot1,0,0,0,0,0,0,1\n")
     for name in ("p.json", "p.uwb", "p.csv", "p.toml", "p.mcap"):
         os.mkfifo(folder / name)
+    (folder / "device.uwb").symlink_to("/dev/zero")
     return folder
 
 
@@ -137,6 +137,9 @@ WORDS = [
     ("calib fit {f_uwb} -o c.json --fold pair", ["--fold", "pair", "--hold-out"]),
     ("uwbsim run icra2023/train -o o.uwb --set tags.6.body=ifo001", ["tags.6.body", "0 to 5", "id 6 has index 5"]),
     ("uwblink import csv {wide_csv} -o o.uwb", ["wide.csv", "UTF-16", "UTF-8"]),
+    ("uwblink import guess {f_uwb}", ["f.uwb", "is a recording already"]),
+    ("calib fit {f_uwb} -o o.json --delays-only --delays-from {c_json}", ["--delays-from: it has the delays of all"]),
+    ("calib fit {f_uwb} -o o.json --delays-only --fix 1=0 --fix 2=0 --fix 3=0", ["--fix: all delays are known"]),
     ("uwblink import guess {wide_csv}", ["wide.csv", "UTF-16", "UTF-8"]),
     ("uwblink import csv {wide_csv} --map {log_toml} -o o.uwb", ["wide.csv", "UTF-16", "UTF-8"]),
     ("calib apply {f_uwb} -c {c_json} -o mine", ["mine", "--force"]),
@@ -145,6 +148,12 @@ WORDS = [
     ("calib report {f_uwb} -o r.html --figures mine", ["mine", "is a file"]),
     ("calib report {f_uwb} -o r.html --figures no/figures", ["no", "does not exist"]),
     ("calib report {f_uwb} -o r.html --loss mixture --sequential", ["--sequential"]),
+    ("uwbsim twin {f_uwb} -c {c_json} -o mine.toml", ["mine.html", "already exists"]),
+    ("uwbsim twin {f_uwb} -c {c_json} -o t.txt", ["found .txt"]),
+    ("uwblink export {f_uwb} --to xls -o out", ["--to", "xls", "csv, parquet, tum, mcap, rosbag2"]),
+    ("uwblink export no.uwb --to csv -o out", ["no such recording"]),
+    ("uwblink export {f_uwb} --to csv -o no/out", ["does not exist"]),
+    ("uwblink export {f_uwb} --to csv -o mine", ["mine", "already exists"]),
     ("calib report no.uwb -o r.html", ["no.uwb", "no such"]),
     ("calib export {c_json} --to csv -o no/out.csv", ["no"]),
     ("uwblink import csv {t_csv_gz} -o o.uwb", ["t.csv.gz", "gzip"]),
@@ -191,12 +200,39 @@ WORDS = [
         "uwbsim run {p_toml} -o o.uwb",
         "uwbsim sweep {p_toml} -o o",
     )),
+    ("uwblink show {device_uwb}", ["device.uwb"]),
     ("uwbsim run noiseless -o o.uwb --set run.seed=" + "[" * 3000, ["run.seed"]),
     # Boards that do not exist.
     *((f"uwblink {words}", ["/dev/nothing", "no such port"]) for words in (
         "info /dev/nothing", "twr /dev/nothing 2", "test /dev/nothing", "set-delay /dev/nothing 1500",
         "passive /dev/nothing on", "send /dev/nothing x", "cir /dev/nothing 2",
         "record /dev/nothing -o x.uwb --pairs all",
+    )),
+    *(("uwblink stream {f_uwb} " + words, naming) for words, naming in (
+        ("--udp here", ["--udp"]), ("--udp 127.0.0.1:0", ["--udp"]),
+        ("--udp no.such.host.invalid:9870", ["no such host"]), ("--foxglove x:y", ["--foxglove"]),
+        ("--use receptions -c {c_json}", ["--use"]), ("--use receptions", ["--use"]),
+        ("--dialect arduino", ["f.uwb", "--dialect"]),
+        ("--rate 5", ["only be used with boards"]), ("-o g.uwb", ["only be used with boards"]),
+    )),
+    ("uwblink stream port --use receptions --dialect arduino", ["--use"]),
+    ("uwblink stream port --ids 40", ["--ids", "--dialect"]),
+    ("uwblink record port --dialect arduino --ids a -o q.uwb", ["--ids: found 'a'"]),
+    ("uwblink record port --dialect arduino --ids 40 -c {c_json} -o q.uwb", ["--calibration", "--live"]),
+    *((f"uwbsim {words}", naming) for words, naming in (
+        ("compare icra2023/test1 -o out --protocols ss,tdoa", ["tdoa", "ss-cfo", "ds-sym"]),
+        ("compare icra2023/test1 -o out --protocols ,", ["found none"]),
+        ("compare icra2023/test1 -o out -n 0", ["-n", "expected 1 to"]),
+        ("compare icra2023/test1 -o no/out", ["does not exist"]),
+        ("predict --protocol aloha", ["aloha", "allowed"]),
+        ("predict --skew-ppm nan", ["--skew-ppm", "nan"]),
+        ("predict --final-delay-us 0", ["--final-delay-us", "1 or more"]),
+        ("predict --tags 1", ["--tags"]),
+        ("optimum no.toml", ["no such"]),
+        ("sweep no.toml -o out", ["no such"]),
+        ("run icra2023/test1 -o o.uwb --through-wire --set ranging.protocol=ds-sym", ["ds-sym", "boards"]),
+        ("serve broadcast", ["ranging.plan: found 'broadcast'"]),
+        ("run broadcast -o b.uwb --through-wire", ["ranging.plan: found 'broadcast'"]),
     )),
     ("uwblink replay {f_uwb}", ["no bytes from boards"]),
     ("uwblink replay {f_uwb} --serve", ["no bytes from boards"]),
@@ -214,6 +250,11 @@ OWN = [
         "uwbsim serve noiseless --faults own.toml",
         "uwblink import csv {r_csv} --map own.toml -o o.uwb",
         "calib survey {f_uwb} --known own.toml -o o.json",
+    )),
+    # Served poses do not replace an input.
+    *((f"{line} --duration 0.1 --force", ["--poses", "is also an input"], text) for line, text in (
+        ("uwbsim serve own.toml --poses own.toml", BENCH.read_text()),
+        ("uwbsim serve {bench} --faults own.toml --poses own.toml", ""),
     )),
     # Misspelt keys.
     (TAGS_LINE, ["own.toml", "lever_arm"], TAGS + "lever_arm = [0.1, 0.0, 0.0]\n"),
@@ -252,6 +293,7 @@ OWN = [
         ('{"schema_version": 1}', ["missing"]),
         ('{"schema_version": 1, "lift": "up"}', ["mean-of-lifted"]),
     )),
+    ("uwbsim twin {f_uwb} -c own.json -o t.toml", ["no schema_version"], "{}"),
     ("calib import miluv own.json -o c.json", ["own.json", "delays_ns"], json.dumps(PUBLISHED)),
 ]  # fmt: skip
 
@@ -356,17 +398,6 @@ def test_terminals_of_which_one_cannot_have_its_link_leave_no_other_link(tmp_pat
     assert [(path.name, path.read_text()) for path in tmp_path.glob("tag*")] == [("tag2", "mine")]
 
 
-def test_served_poses_do_not_replace_an_input(tmp_path):
-    for given in ("scenario", "faults"):
-        (tmp_path / "scenario").write_text(BENCH.read_text())
-        (tmp_path / "faults").write_text("")
-        words = (tmp_path / "scenario", "--faults", tmp_path / "faults", "--duration", 0.1)
-        refuse(
-            "uwbsim", "serve", *words, "--poses", tmp_path / given, "--force", naming=["--poses", "is also an input"]
-        )
-        assert (tmp_path / "scenario").read_text() == BENCH.read_text()
-
-
 @pytest.mark.slow
 def test_the_command_printed_by_a_server_records_and_replay_repeats_it(tmp_path, ports):
     said = succeed("uwbsim", "serve", BENCH, "--link-dir", tmp_path / "ports", "--duration", 0.1)
@@ -403,7 +434,7 @@ def test_a_folder_with_something_else_in_it_is_not_replaced(seeds, tmp_path):
         succeed(*export.format(f_uwb=seeds / "f.uwb").split(), cwd=tmp_path)
     (tmp_path / "out" / "deep").mkdir()
     (tmp_path / "out" / "deep" / "thesis.txt").write_text("mine")
-    refused(seeds, tmp_path, export, ["out", "deep"])
+    refused(seeds, tmp_path, export, ["out", "contains deep"])
 
 
 def nothing(*names):
@@ -425,6 +456,11 @@ FIT = "calib fit {here}/bad.uwb -o c.json"
         ({"poses": POSES[:0]}, FIT, ["bad.uwb", "no true distance"]),
         ({"poses": replace(POSES, position_m=POSES.position_m * 1000)}, FIT, ["bad.uwb", "millimetres"]),
         ({"fpp1_dbm": -SAMPLE.fpp1_dbm, "fpp2_dbm": -SAMPLE.fpp2_dbm}, FIT, ["bad.uwb", "dBm"]),
+        (
+            {"rows": slice(99)},
+            "uwbsim twin {here}/bad.uwb -c {c_json} -o t.toml",
+            ["99 exchanges, but a twin needs 100 or more"],
+        ),
         # Two pairs do not determine three delays.
         ({"tags": []}, "uwbsim twin {here}/bad.uwb -c {c_json} -o t.toml", ["tag 1, 2, 3", "uwblink poses --tags"]),
         (
@@ -543,20 +579,6 @@ def test_a_twin_does_without_exchanges_of_a_tag_with_itself(tmp_path):
     assert with_itself["exchanges"] == whole["exchanges"] - len(target[::50])
     # Two fewer in a hundred give the same to a few per cent.
     assert with_itself["receive_noise_ps"] == pytest.approx(whole["receive_noise_ps"], rel=0.1)
-
-
-def test_fits_of_known_delays_without_a_curve_are_refused(seeds):
-    for known, said in (
-        ({"delays_from": seeds / "c.json"}, "`delays_from`: it has the delays of all tags"),
-        ({"fixed_ns": {1: 0.0, 2: 0.0, 3: 0.0}}, "`fixed_ns`: all delays are known"),
-    ):
-        with pytest.raises(calib.BadInputError, match=said):
-            calib.fit(calib.sample_flight(COUNT), **known, delays_only=True)
-
-
-def test_a_recording_is_no_table_to_guess_at(seeds):
-    with pytest.raises(ImportTableError, match="is a recording already"):
-        guess_map(seeds / "f.uwb")
 
 
 def test_empty_recordings_can_be_written_and_read():

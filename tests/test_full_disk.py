@@ -110,13 +110,14 @@ SAME = {
     "calib plan flight --output": "calib plan survey --output",
     "calib plan survey --figures": "calib compare --figures",
     "calib plan flight --figures": "calib compare --figures",
+    # One recorder serves both commands.
+    "uwblink record --output": "uwblink stream --output",
     # The same function imports all forms of a source.
     "uwblink import miluv --output": "uwblink import csv --output",
 }
 """Outputs written by the same function as another row of the table."""
 
 ELSEWHERE = {
-    "uwblink record --output": "uwblink/boards/test_recorder.py",
     "uwblink stream --output": "test_full_disk.py",
     "uwbsim sweep --output": "uwbsim/sweep/test_machine_faults.py",
     "uwblink cir --plot": "test_full_disk.py",

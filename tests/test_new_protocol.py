@@ -1,12 +1,11 @@
 """A protocol registered at run time works with every command, and is exact without noise."""
 
 import json
-import shlex
 
 import numpy as np
 import pytest
 
-from tests import pages
+from tests import pages, processes
 from tests.uwblink.test_register_protocol import SYMMETRIC, TARGETS
 from tests.uwbsim.simulation.test_protocols import bench
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT, load, register_protocol
@@ -20,7 +19,7 @@ SCENARIO = "scenarios/noiseless.toml"
 
 def command(*words):
     """Run a command in this process, which has registered the protocol; return its output."""
-    return pages.command(shlex.join(map(str, words)))
+    return processes.succeed(*words).stdout
 
 
 @pytest.fixture(params=[SYMMETRIC, TARGETS], ids=lambda row: row.name)
@@ -65,8 +64,7 @@ def test_run_show_and_fit(row, tmp_path):
     flown = load(flight)
     assert set(flown.exchanges.protocol.tolist()) == {row.name}
     # The scenario has no bias; 60 s of noiseless stamps leave a picosecond, and a small variation of the spline.
-    found = json.loads(fitted.read_text())["delays_ns"]
-    assert found == pytest.approx(flown.meta["planted"]["delays_ns"], abs=5e-3)
+    assert json.loads(fitted.read_text())["delays_ns"] == pytest.approx(flown.meta["planted"]["delays_ns"], abs=5e-3)
 
 
 @pytest.mark.slow

@@ -44,8 +44,8 @@ def installed(tmp_path_factory):
 
 @pytest.fixture
 def run(installed):
-    """Return a function that runs a command in a process with the distribution."""
-    return partial(processes.run, env=installed, timeout=300)
+    """Return a function that runs a command, which must succeed, in a process with the distribution."""
+    return partial(processes.succeed, env=installed, timeout=300)
 
 
 WARNING = (
@@ -58,11 +58,9 @@ WARNING = (
 def test_protocol_and_loss_of_another_distribution_are_simulated_and_fitted_with(run, tmp_path):
     flight = tmp_path / "f.uwb"
     settings = ("--set", "ranging.protocol=strange-ds", "--set", "run.duration_s=30")
-    done = run("uwbsim", "run", "scenarios/noiseless.toml", "-o", flight, *settings)
-    assert (done.returncode, done.stderr) == (0, WARNING)
-    done = run("calib", "fit", flight, "-o", tmp_path / "c.json", "--loss", "welsch")
-    left_out = "'bad' of strange-ranging (group uwbcal.losses) is left out"
-    assert (done.returncode, left_out in done.stderr) == (0, True), done.stderr
+    assert run("uwbsim", "run", "scenarios/noiseless.toml", "-o", flight, *settings).stderr == WARNING
+    fitted = run("calib", "fit", flight, "-o", tmp_path / "c.json", "--loss", "welsch")
+    assert "'bad' of strange-ranging (group uwbcal.losses) is left out" in fitted.stderr
     document = json.loads((tmp_path / "c.json").read_text())
     planted = {"1": -0.36, "2": -0.01, "3": 0.24, "4": -0.36}
     assert document["loss"] == "welsch"
@@ -72,9 +70,9 @@ def test_protocol_and_loss_of_another_distribution_are_simulated_and_fitted_with
 def test_an_effect_of_another_distribution_applies_to_the_flights_of_the_command_and_is_recorded(run, tmp_path):
     settings = ("--set", "run.duration_s=1", "--set", "radio.quantize=false")
     powers, recorded = list[Any](), list[Any]()
-    for command in (run, processes.run):
+    for command in (run, processes.succeed):
         flight = tmp_path / f"{len(powers)}.uwb"
-        assert command("uwbsim", "run", "scenarios/noiseless.toml", "-o", flight, *settings).returncode == 0
+        command("uwbsim", "run", "scenarios/noiseless.toml", "-o", flight, *settings)
         with Recording.open(flight) as opened:
             powers.append(opened.exchanges().fpp1_dbm)
             recorded.append(opened.meta().get("channel_effects"))
@@ -88,53 +86,50 @@ def test_workers_in_other_processes_load_the_plugin(run, tmp_path):
         '[sweep]\nscenario = "noiseless"\nprotocols = ["strange-ds"]\n'
         "ranges = 1000\nseeds = [1, 2]\n[vary]\n'radio.rx_noise_ps' = [100.0, 200.0]\n"
     )
-    done = run("uwbsim", "sweep", tmp_path / "s.toml", "-o", tmp_path / "out", "--workers", "2")
-    assert done.returncode == 0, done.stderr
+    run("uwbsim", "sweep", tmp_path / "s.toml", "-o", tmp_path / "out", "--workers", "2")
     assert (tmp_path / "out" / "results.csv").read_text().count("strange-ds") == 4
 
 
 def test_the_importer_of_another_distribution_is_a_command_and_without_it_its_recordings_say_so(run, tmp_path):
     (tmp_path / "t.eight").write_text("1 2 0 5 1005 3000 99005 101000\n")
     done = run("uwblink", "import", "eight", tmp_path / "t.eight", "-o", tmp_path / "t.uwb")
-    assert (done.returncode, done.stdout) == (0, f"{tmp_path / 't.uwb'}: 1 exchanges\n"), done.stderr
+    assert done.stdout == f"{tmp_path / 't.uwb'}: 1 exchanges\n"
     shown = json.loads(run("uwblink", "show", tmp_path / "t.uwb", "--json").stdout)
     assert shown["protocols"] == {"strange-ds": 1}
-    told = processes.refuse("uwblink", "show", tmp_path / "t.uwb")
-    for part in (f"{tmp_path / 't.uwb'}: ", "'strange-ds'", "uwbcal.protocols", "ss, ss-cfo, ds"):
-        assert part in told
+    naming = [f"{tmp_path / 't.uwb'}: ", "'strange-ds'", "uwbcal.protocols", "ss, ss-cfo, ds"]
+    processes.refuse("uwblink", "show", tmp_path / "t.uwb", naming=naming)
 
 
-def test_its_exporter_correction_and_evaluator_are_used(run, tmp_path):
+def test_its_exporter_correction_and_evaluator_are_used(installed, run, tmp_path):
     flight = tmp_path / "f.uwb"
-    assert run("calib", "sample", "-o", flight, "-n", 300).returncode == 0
-    assert run("uwblink", "export", flight, "--to", "pairs", "-o", tmp_path / "out").returncode == 0
+    run("calib", "sample", "-o", flight, "-n", 300)
+    run("uwblink", "export", flight, "--to", "pairs", "-o", tmp_path / "out")
     written = (tmp_path / "out" / "pairs.txt").read_text().splitlines()
     assert (len(written), set(written)) == (300, {"1 2", "2 3", "3 1"})
 
     (tmp_path / "s.toml").write_text(
         '[sweep]\nscenario = "noiseless"\nkind = "count"\n[vary]\n"run.duration_s" = [1.0, 2.0]\n'
     )
-    done = run("uwbsim", "sweep", tmp_path / "s.toml", "-o", tmp_path / "swept", "--workers", "1")
-    assert done.returncode == 0, done.stderr
+    run("uwbsim", "sweep", tmp_path / "s.toml", "-o", tmp_path / "swept", "--workers", "1")
     header, *rows = [line.split(",") for line in (tmp_path / "swept" / "results.csv").read_text().splitlines()]
     counts = [int(row[header.index("exchanges")]) for row in rows]
     assert counts[1] == 2 * counts[0] > 0
     (tmp_path / "s.toml").write_text((tmp_path / "s.toml").read_text().replace("count", "cuont"))
-    done = run("uwbsim", "sweep", tmp_path / "s.toml", "-o", tmp_path / "no", "--workers", "1")
-    assert (done.returncode, (tmp_path / "no").exists()) == (2, False)
-    assert "sweep.kind: found 'cuont', expected calibrate, compare, count, or a name" in done.stderr
+    words = ("uwbsim", "sweep", tmp_path / "s.toml", "-o", tmp_path / "no", "--workers", "1")
+    naming = ["sweep.kind: found 'cuont', expected calibrate, compare, count, or a name"]
+    processes.refuse(*words, env=installed, naming=naming)
+    assert not (tmp_path / "no").exists()
 
     (tmp_path / "offset.txt").write_text("100.0")
-    done = run("uwblink", "stream", flight, "--speed", "inf", "-c", tmp_path / "offset.txt")
-    rows = [json.loads(line) for line in done.stdout.splitlines()]
-    assert len(rows) == 300, done.stderr
+    streamed = run("uwblink", "stream", flight, "--speed", "inf", "-c", tmp_path / "offset.txt")
+    rows = [json.loads(line) for line in streamed.stdout.splitlines()]
+    assert len(rows) == 300
     assert [row["corrected_m"] for row in rows] == pytest.approx([row["range_m"] - 100.0 for row in rows], abs=1e-3)
 
 
 @pytest.mark.parametrize("command", ["uwblink", "uwbsim", "calib"])
 def test_help_loads_no_plug_in(run, command):
-    done = run(command, "--help")
-    assert (done.returncode, done.stderr) == (0, "")
+    assert run(command, "--help").stderr == ""
 
 
 @dataclass(frozen=True)

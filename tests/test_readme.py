@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 import tomllib
 from contextlib import contextmanager
 
@@ -98,9 +97,7 @@ def serving(folder, label, *files):
     words = serve.split()
     server = subprocess.Popen([processes.BIN / words[0], *words[1:]], cwd=folder, stdout=subprocess.DEVNULL)
     try:
-        while not all((folder / name).exists() for name in files):
-            assert server.poll() is None
-            time.sleep(0.05)
+        processes.wait_until(lambda: all((folder / name).exists() for name in files), server)
         yield
     finally:
         server.send_signal(signal.SIGINT)

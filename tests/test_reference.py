@@ -66,8 +66,7 @@ def test_the_reference_of_calibrations_has_every_key_of_files_and_no_other():
     found = set()
     for settings in ({}, {"groups": groups}, {"constants": "pair"}):
         calibration = calib.fit(flight, **settings).calibration
-        received = dataclasses.replace(calibration, power_at="reception")
-        for one in (calibration, received):
+        for one in (calibration, dataclasses.replace(calibration, power_at="reception")):
             found |= set(flat(json.loads(one.to_json())))
     matrix = ((0.0,) * 8,) * 8
     patterns = (Pattern((1,), matrix[0], matrix[0], matrix, 0.0),)

@@ -3,15 +3,14 @@
 Real boards are tested if the environment variable UWB_PORTS names two ports, separated by a comma.
 """
 
-import ast
 import re
 from collections import Counter
-from pathlib import Path
 
 import pytest
 
 from tests.boards import bench_scenario, two_ports
 from tests.contract.test_firmware import played
+from tests.uwblink.wire import transcripts
 from uwblink.boards.board import Board
 from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
 from uwblink.ticks import elapsed
@@ -200,23 +199,8 @@ def test_a_hanging_board_is_named_with_what_was_sent_and_heard(kind):
 # The captured transcripts as command scripts: virtual boards answer in the format and order of the firmware.
 
 
-FILE = Path(__file__).parents[1] / "golden" / "board_transcripts.txt"
-LINE = re.compile(r"^ +([\d.]+) ms +board (\d+) +(<-host|->host) +(b\".*\")$")
 MS = 1_000_000
-
-
-def scripts():
-    """Return pieces of the transcript that start with fresh boards: lists of (ms, board, direction, bytes)."""
-    pieces: list[list[tuple[float, int, str, bytes]]] = []
-    current: list[tuple[float, int, str, bytes]] = []
-    for text in FILE.read_text().splitlines():
-        if text.startswith(("====", "--")):
-            pieces.append(current)
-            current = []
-        elif match := LINE.match(text):
-            current.append((float(match[1]), int(match[2]), match[3], ast.literal_eval(match[4])))
-    pieces.append(current)
-    return [piece for piece in pieces if any(line[2] == "<-host" for line in piece)]
+SCRIPTS = [piece for piece in transcripts.pieces() if any(way == "<-host" for _, _, way, _ in piece)]
 
 
 def shape(data):
@@ -229,7 +213,7 @@ def shape(data):
     return (*parts[:ids], kinds)
 
 
-@pytest.mark.parametrize("script", scripts(), ids=lambda s: repr(next(x[3] for x in s if x[2] == "<-host"))[:30])
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda s: repr(next(x[3] for x in s if x[2] == "<-host"))[:30])
 def test_answers_have_the_firmware_s_shapes_order_and_timing(script):
     ports = VirtualPorts(bench_scenario(rx_noise_ps=100.0))
     bench = ports.bench

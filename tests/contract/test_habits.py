@@ -42,8 +42,7 @@ class Client:
         data, self.came = self.came, b""
         found = []
         for part in re.split(rb"(?=[RS]\d\d\|)", data):
-            decoder = Decoder(REPORTS)
-            found += [e for e in decoder.feed(part) if isinstance(e, m.Message)]
+            found += [e for e in Decoder(REPORTS).feed(part) if isinstance(e, m.Message)]
         return found
 
 

@@ -13,6 +13,7 @@ import pytest
 import calib
 import uwblink
 from tests.processes import refuse, succeed
+from tests.registered import registered
 from uwblink.boards import DIALECTS, Dialect, LivePage, PrintedRange, dialect_of, load_correction
 from uwblink.boards.dialects import Printed
 from uwblink.boards.ports import Terminal
@@ -131,32 +132,34 @@ def test_maps_have_the_same_effect_for_boards_and_logs(tmp_path):
     power_dbm = 10 * math.log10((9000**2 + 8000**2 + 7000**2) / 118**2) - 121.74
     assert (one.from_id, one.to_id, one.range_m) == (None, 65535, 1.25)
     assert one.power_dbm == pytest.approx(power_dbm)
-    (tmp_path / "no_target.toml").write_text('line = "{from_id} {range_m}"\n')
-    with pytest.raises(ImportTableError, match="to_id"):
-        dialect_of(str(tmp_path / "no_target.toml"))
+    for text, error, said in (
+        ('line = "{from_id} {range_m}"\n', ImportTableError, "to_id"),
+        ('[columns]\nrange_m = "d"\n', ArgumentError, "line"),
+    ):
+        (tmp_path / "wrong.toml").write_text(text)
+        with pytest.raises(error, match=said):
+            dialect_of(str(tmp_path / "wrong.toml"))
 
 
-def test_another_form_ends_with_a_line_and_no_file(tmp_path):
-    with printing("hello 1\r\n" * 20) as port:
-        for words, naming in (
-            ("--dialect arduino", [port, "no range in", "hello 1", "dialect"]),
-            ("--dialect nonsense", ["--dialect", "dwm1001-lec"]),
-            ("--dialect arduino --pairs all", ["--pairs", "--dialect"]),
-            ("--dialect arduino --ids 1,2", ["1 ports, but 2 ids"]),
-        ):
-            record = ("uwblink", "record", port, "--duration", "30", "-o", "r.uwb")
-            refuse(*record, *words.split(), cwd=tmp_path, naming=naming)
-    # It is the only device that answers: of others, what was recorded would be kept.
-    with printing(BOTH.splitlines(keepends=True)[0]) as port:
-        same = ("uwblink", "record", port, "--duration", "30", "-o", "r.uwb", "--dialect", "arduino")
-        refuse(*same, "--ids", "6018", cwd=tmp_path, naming=[port, "6018", "own id", "--ids"])
-    with printing("") as port:
-        brief = ("uwblink", "record", port, "--dialect", "arduino", "--duration", "0.3", "-o", "r.uwb")
-        refuse(*brief, cwd=tmp_path, naming=["no range was printed"])
-    (tmp_path / "m.toml").write_text('[columns]\nrange_m = "d"\n')
-    with pytest.raises(ArgumentError, match="line"):
-        dialect_of(str(tmp_path / "m.toml"))
-    assert {path.name for path in tmp_path.iterdir()} == {"m.toml"}
+@pytest.mark.parametrize(
+    ("text", "words", "naming"),
+    [
+        ("hello 1\r\n" * 20, "--dialect arduino", ["{port}", "no range in", "hello 1", "dialect"]),
+        ("hello 1\r\n" * 20, "--dialect nonsense", ["--dialect", "dwm1001-lec"]),
+        ("hello 1\r\n" * 20, "--dialect arduino --pairs all", ["--pairs", "--dialect"]),
+        ("hello 1\r\n" * 20, "--dialect arduino --ids 1,2", ["1 ports, but 2 ids"]),
+        # It is the only device that answers: of others, what was recorded would be kept.
+        (BOTH.splitlines(keepends=True)[0], "--dialect arduino --ids 6018", ["{port}", "6018", "own id", "--ids"]),
+        ("", "--dialect arduino --duration 0.3", ["no range was printed"]),
+    ],
+)
+def test_another_form_ends_with_a_line_and_no_file(tmp_path, text, words, naming):
+    with printing(text) as port:
+        naming = [part.format(port=port) for part in naming]
+        refuse(
+            "uwblink", "record", port, "--duration", "30", "-o", "r.uwb", *words.split(), cwd=tmp_path, naming=naming
+        )
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_board_that_is_unplugged_keeps_what_was_recorded(tmp_path):
@@ -182,19 +185,14 @@ def test_dialects_come_by_entry_points_and_words_get_ids():
         cells = (line.partition("=") for line in lines)
         return [PrintedRange(to_id=who, range_m=float(far)) for who, _, far in cells if far]
 
-    DIALECTS.register(Dialect("mine", "A form of my own.", parse))
-    try:
-        with printing("alpha=1.0\nbeta=2.0\nbad line\n") as port:
-            seen = Printed()
-            batches = uwblink.boards.printed_ranges([port], dialect_of("mine"), ids=[1], duration_s=1.0, seen=seen)
-            found = [turn for turns in batches for turn in turns]
-        # Words have ids after that of the board, in the order of their appearance.
-        assert sorted(seen.numbers.values()) == [1, 2, 3]
-        named = {number: name for name, number in seen.numbers.items()}
-        told = {(named[turn.pair[1]], turn.report.range_m) for turn in found}
-        assert told == {("alpha", 1.0), ("beta", 2.0)}
-    finally:
-        DIALECTS.remove("mine")
+    mine, seen = Dialect("mine", "A form of my own.", parse), Printed()
+    with registered(DIALECTS, mine), printing("alpha=1.0\nbeta=2.0\nbad line\n") as port:
+        batches = uwblink.boards.printed_ranges([port], dialect_of("mine"), ids=[1], duration_s=1.0, seen=seen)
+        found = [turn for turns in batches for turn in turns]
+    # Words have ids after that of the board, in the order of their appearance.
+    assert sorted(seen.numbers.values()) == [1, 2, 3]
+    named = {number: name for name, number in seen.numbers.items()}
+    assert {(named[turn.pair[1]], turn.report.range_m) for turn in found} == {("alpha", 1.0), ("beta", 2.0)}
     with pytest.raises(ArgumentError, match="parse"):
         DIALECTS.register(Dialect("bad", "No function.", None))  # type: ignore[arg-type]
 
@@ -237,13 +235,6 @@ def test_a_stream_is_recorded_as_well_and_the_command_serves_the_page(tmp_path):
         words = ("--dialect", "arduino", "--ids", "40", "-c", "c.json", "--duration", "1.0", "-o")
         streamed = succeed("uwblink", "stream", port, *words, "s.uwb", cwd=tmp_path)
         recorded = succeed("uwblink", "record", port, *words, "r.uwb", "--live", cwd=tmp_path)
-        for wrong, naming in (
-            (("record", port, *words, "q.uwb"), ["--calibration", "--live"]),
-            (("record", port, "--dialect", "arduino", "--ids", "a", "-o", "q.uwb"), ["--ids: found 'a'"]),
-            (("stream", port, "--ids", "40"), ["--ids", "--dialect"]),
-            (("stream", "r.uwb", "--dialect", "arduino"), ["r.uwb", "--dialect"]),
-        ):
-            refuse("uwblink", *wrong, cwd=tmp_path, naming=naming)
     rows = [json.loads(line) for line in streamed.stdout.splitlines()]
     assert len(uwblink.load(tmp_path / "s.uwb").exchanges) == len(rows) >= 5
     assert [row["corrected_m"] for row in rows] == pytest.approx([0.75] * len(rows))

@@ -18,7 +18,7 @@ import calib
 import uwblink
 from tests.boards import bench_scenario, record_bench, served
 from tests.browser import chromium
-from tests.processes import BIN
+from tests.processes import BIN, wait_until
 from uwblink.boards import live_page
 from uwblink.boards.listeners import PairState, Progress, Turn, load_correction
 from uwblink.boards.live_page import LivePage
@@ -194,8 +194,7 @@ def test_faulty_connections_have_no_effect(tmp_path, capfd):
                 with contextlib.suppress(OSError):
                     client.sendall(request)
         assert fetch(page)[0]["Content-Type"] == "text/html; charset=utf-8"
-        while any("process_request_thread" in thread.name for thread in threading.enumerate()):
-            time.sleep(0.01)
+        wait_until(lambda: not any("process_request_thread" in thread.name for thread in threading.enumerate()))
     assert capfd.readouterr() == ("", "")
 
 
@@ -256,15 +255,14 @@ def test_the_command_prints_the_address_of_the_page_and_serves_it(tmp_path):
         words = [str(BIN / "uwblink"), "record", *ports, "-o", str(tmp_path / "f.uwb"), "--pairs", "all", "--live"]
         process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         url = re.search(r"live page: (http://127\.0\.0\.1:\d+/)", process.stderr.readline())[1]
-        for _ in range(2400):
+
+        def drawn():
             with urllib.request.urlopen(url + "body", timeout=30) as answer:  # noqa: S310 - the page's own address
-                text = answer.read().decode()
-            if text.count("<polyline") == 3:
-                break
-            time.sleep(0.05)
+                return answer.read().decode().count("<polyline")
+
+        wait_until(lambda: drawn() == 3, process)  # three pairs, without a calibration
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
-    assert text.count("<polyline") == 3, "three pairs, without a calibration"
     assert (process.returncode, " exchanges in " in out) == (0, True), err
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(url, timeout=5)  # noqa: S310

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.boards import bench_scenario, record_bench, served
-from tests.processes import BIN
+from tests.processes import BIN, wait_until
 from uwblink import RangingPlan, Recording, load, record
 from uwblink.boards import decode_again
 from uwblink.boards.listeners import Listener, Progress
@@ -36,32 +36,34 @@ def test_an_arrangement_is_marked_from_beginning_to_end(tmp_path):
     assert mark.start_ns <= time_ns.min() < time_ns.max() < mark.end_ns < mark.start_ns + 1.2e9
 
 
+def places_of(*numbers):
+    return RangingPlan(tags=tuple(Tag(number, "drone", (0.1, 0.0, 0.0)) for number in numbers))
+
+
 @pytest.mark.parametrize(
-    ("given", "named"),
+    ("given", "error", "said"),
     [
-        ({"arrangement": "A", "known": "plane", "order": (30, 10, 20)}, "order"),
-        ({"arrangement": "A", "known": "line", "order": (10, 20)}, "each of the boards at the"),
-        ({"known": "line"}, "known"),
-        ({"arrangement": "A", "known": "ring"}, "known"),
+        ({"arrangement": "A", "known": "plane", "order": (30, 10, 20)}, PlanError, "order"),
+        ({"arrangement": "A", "known": "line", "order": (10, 20)}, PlanError, "each of the boards at the"),
+        ({"known": "line"}, PlanError, "known"),
+        ({"arrangement": "A", "known": "ring"}, PlanError, "known"),
+        (
+            {"plan": places_of(20, 10)},
+            PlanError,
+            "the plan has positions of the tags 10, 20, but the boards at the ports are 1, 2, 3",
+        ),
+        ({"listeners": [3]}, TypeError, "listeners: found 3, expected a Listener or a function"),
+        *(({"duration_s": seconds}, PlanError, "duration_s") for seconds in (0.0, -1.0, float("nan"))),
     ],
 )
-def test_impossible_arrangements_are_refused(tmp_path, given, named):
-    with pytest.raises(PlanError, match=named):
+def test_impossible_arrangements_plans_listeners_and_durations_are_refused(tmp_path, given, error, said):
+    with pytest.raises(error, match=said):
         record_bench(tmp_path / "a.uwb", **given)
     assert not list(tmp_path.iterdir())
 
 
-def test_plans_with_other_boards_are_refused_before_recording(tmp_path):
-    others, own = (
-        RangingPlan(tags=tuple(Tag(number, "drone", (0.1, 0.0, 0.0)) for number in numbers))
-        for numbers in ((20, 10), (1,))
-    )
-    with pytest.raises(
-        PlanError, match="the plan has positions of the tags 10, 20, but the boards at the ports are 1, 2, 3"
-    ):
-        record_bench(tmp_path / "a.uwb", others, duration_s=0.5)
-    assert not list(tmp_path.iterdir())
-    assert record_bench(tmp_path / "a.uwb", own, duration_s=0.2).exchanges
+def test_a_plan_with_the_position_of_one_of_the_boards_is_recorded(tmp_path):
+    assert record_bench(tmp_path / "a.uwb", places_of(1), duration_s=0.2).exchanges
 
 
 @pytest.mark.parametrize("known", ["line 1 1", "plane 1 2", "line 1 b", "line  1"])
@@ -179,14 +181,9 @@ def command(path, server, *more):
 
 
 def wait_for_rows(path, process):
-    """Wait until a recorder has committed some hundred rows, which takes longer under load."""
+    """Wait until a recorder has committed some hundred rows."""
     log = Path(f"{path}.wal")
-    for _ in range(2400):
-        if log.exists() and log.stat().st_size > 30_000:
-            return
-        assert process.poll() is None
-        time.sleep(0.05)
-    raise AssertionError("the recorder wrote nothing in two minutes")
+    wait_until(lambda: log.exists() and log.stat().st_size > 30_000, process)
 
 
 def test_ctrl_c_ends_cleanly_and_completely(tmp_path):
@@ -246,10 +243,7 @@ def test_a_recorder_that_is_killed_as_it_begins_leaves_a_recording_or_nothing(tm
     path = tmp_path / "f.uwb"
     with served() as server:
         process = subprocess.Popen(command(path, server), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        end_s = time.monotonic() + 60
-        while not any(tmp_path.glob(kind)):
-            assert process.poll() is None
-            assert time.monotonic() < end_s
+        wait_until(lambda: any(tmp_path.glob(kind)), process, step_s=0.0)
         process.kill()
         process.wait()
     if path.exists():
@@ -257,29 +251,6 @@ def test_a_recorder_that_is_killed_as_it_begins_leaves_a_recording_or_nothing(tm
         assert (found.meta["source"], len(found.exchanges) < 50) == ("boards", True)
     else:
         assert kind != "f.uwb"
-
-
-@pytest.mark.slow
-def test_a_full_disk_ends_with_a_clear_line_and_a_readable_file(tmp_path):
-    path = tmp_path / "f.uwb"
-    with served() as server:
-        words = " ".join(command(path, server, "--duration", "30", "--passive", "--cir"))
-        limited = ["bash", "-c", f"ulimit -f 3000; exec {words}"]  # blocks of 1024 bytes, the limit for one file
-        done = subprocess.run(limited, capture_output=True, text=True, timeout=60)
-    assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stdout + done.stderr
-    assert "cannot be written any more" in done.stderr.splitlines()[-1]
-    assert len(load(path).exchanges) > 0
-
-
-@pytest.mark.slow
-def test_one_port_is_for_one_process(tmp_path):
-    with served() as server:
-        process = subprocess.Popen(command(tmp_path / "f.uwb", server, "--duration", "200"), stdout=subprocess.DEVNULL)
-        wait_for_rows(tmp_path / "f.uwb", process)
-        done = subprocess.run([str(BIN / "uwblink"), "info", server.names[1]], capture_output=True, text=True)
-        process.send_signal(signal.SIGINT)
-        process.wait()
-    assert (done.returncode, "another process has this port open" in done.stderr) == (2, True)
 
 
 def test_damage_other_messages_and_the_bytes_of_an_unfinished_one_are_decoded_again(tmp_path):

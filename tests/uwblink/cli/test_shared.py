@@ -6,13 +6,14 @@ import re
 import signal
 import subprocess
 import sys
-import time
 import warnings
 
 import numpy as np
 import pytest
 import typer
 
+import uwblink
+from tests.processes import wait_until
 from tests.shared_data import ROOT
 from uwblink.cli import shared
 from uwblink.cli.commands import app
@@ -92,7 +93,7 @@ def test_only_warnings_of_plug_ins_become_lines(capsys):
 def test_python_m_is_the_command(package):
     found = subprocess.run([sys.executable, "-m", package, "--version"], capture_output=True, text=True, check=True)
     first, beside = found.stdout.splitlines()
-    assert re.fullmatch(package + r" [0-9]+\.[0-9]+\.[0-9]+", first)
+    assert first == f"{package} {uwblink.__version__}"
     assert re.fullmatch(r"Python 3\.[0-9.]+, numpy [0-9.]+, .*duckdb [0-9.]+, .*", beside)
 
 
@@ -149,11 +150,6 @@ start(command)
 """
 
 
-def test_finished_commands_keep_their_status_when_interrupted():
-    done = subprocess.run([sys.executable, "-c", INTERRUPTED_AT_THE_END], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
-
-
 STUCK = """
 import os, signal, sys, time
 import typer
@@ -176,11 +172,6 @@ run(app, arguments=[])
 """
 
 
-def test_a_third_interrupt_ends_a_command_that_hangs():
-    done = subprocess.run([sys.executable, "-c", STUCK], capture_output=True, text=True, timeout=90)
-    assert (done.returncode, done.stdout) == (-signal.SIGINT, "cleaned\n")
-
-
 IMPORTED = """
 import os, signal, weakref
 
@@ -194,11 +185,8 @@ del lock
 """
 
 
-def test_an_interrupt_during_an_import_is_not_dropped(tmp_path):
-    (tmp_path / "imported.py").write_text(IMPORTED)
-    command = (
-        STUCK.split("app =")[0]
-        + """
+IMPORTING = f"""
+{STUCK.split("app =")[0]}
 app = typer.Typer()
 
 @app.command()
@@ -209,9 +197,20 @@ def work():
 
 run(app, arguments=[])
 """
-    )
-    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, timeout=90, cwd=tmp_path)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+@pytest.mark.parametrize(
+    ("script", "status", "out", "err"),
+    [
+        pytest.param(INTERRUPTED_AT_THE_END, 0, "", "", id="a finished command keeps its status"),
+        pytest.param(STUCK, -signal.SIGINT, "cleaned\n", "", id="the third ends a command that hangs"),
+        pytest.param(IMPORTING, 130, "", "interrupted\n", id="one during an import is not dropped"),
+    ],
+)
+def test_interrupts(tmp_path, script, status, out, err):
+    (tmp_path / "imported.py").write_text(IMPORTED)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=90, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (status, out, err)
 
 
 # The progress line of a command.
@@ -228,10 +227,7 @@ def test_progress_on_a_terminal_is_shown_and_removed(monkeypatch):
     with waiting("fitting [1]") as update:
         update("drawing")
         update(0.25)
-        begun = time.monotonic()
-        while not all(shown in screen.getvalue() for shown in ("fitting [1]", "drawing", "25%")):
-            assert time.monotonic() - begun < 20
-            time.sleep(0.01)
+        wait_until(lambda: all(shown in screen.getvalue() for shown in ("fitting [1]", "drawing", "25%")))
     assert screen.getvalue().endswith("\x1b[2K")
 
 

@@ -12,9 +12,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 import calib
+from tests.registered import registered
 from tests.uwblink.recording.test_contents import full, rows  # noqa: F401 - full is a fixture
 from uwblink import Contents, Exchanges, Recording, import_recording, load
-from uwblink.errors import ArgumentError, ImportTableError, RecordingError, RecordingExistsError, RecordingMissingError
+from uwblink.errors import ArgumentError, ImportTableError, RecordingError, RecordingExistsError
 from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
 from uwblink.importers import read_source
 from uwblink.importers.poses import read_poses
@@ -61,21 +62,9 @@ def test_trajectories(tmp_path):
     assert [line.split()[0] for line in other.splitlines()] == ["-1.500000000", "-0.250000000", "0.750000000"]
 
 
-def test_failed_exports_leave_no_files(whole, tmp_path):
+def test_an_earlier_export_is_replaced(whole, tmp_path):
     (tmp_path / "there").mkdir()
-    (tmp_path / "there" / "mine").write_text("mine")
-    before = sorted(tmp_path.rglob("*"))
-    for error, said, path, out, to, force in (
-        (ArgumentError, "`to`: found 'xls', allowed: csv, parquet, tum, mcap, rosbag2", whole, "out", "xls", False),
-        (RecordingMissingError, "no such recording", tmp_path / "no.uwb", "out", "csv", False),
-        (RecordingError, "does not exist", whole, "no/out", "csv", False),
-        (RecordingExistsError, "already exists", whole, "there", "csv", False),
-        (RecordingError, "contains mine", whole, "there", "csv", True),
-    ):
-        with pytest.raises(error, match=said):
-            export_recording(path, tmp_path / out, to=to, force=force)
-    assert (sorted(tmp_path.rglob("*")), (tmp_path / "there" / "mine").read_text()) == (before, "mine")
-    (tmp_path / "there" / "mine").rename(tmp_path / "there" / "meta.csv")
+    (tmp_path / "there" / "meta.csv").write_text("mine")
     export_recording(whole, tmp_path / "there", to="csv", force=True)
     assert sorted(path.stem for path in (tmp_path / "there").iterdir()) == sorted(TABLES)
 
@@ -111,11 +100,8 @@ def test_registered_exporters_are_used(whole, tmp_path):
         (folder / "name.txt").write_text(recording.name)
         return {"name.txt": 1}
 
-    register_exporter(Exporter("names", write, "the name"))
-    try:
+    with registered(EXPORTERS, Exporter("names", write, "the name")):
         assert export_recording(whole, tmp_path / "out", to="names") == {"name.txt": 1}
-    finally:
-        EXPORTERS.remove("names")
     with pytest.raises(ArgumentError, match="this name is reserved"):
         register_exporter(Exporter("csv", write, "mine"))
 
@@ -260,8 +246,7 @@ def test_every_message_is_there_in_order_of_time(recording, tmp_path):
     for column in ("initiator", "target", "range_m", "fpp1_dbm"):
         assert content[column] == getattr(held.exchanges, column)[earliest]
     assert "fpp2_dbm" not in content, "JSON has no word for what was not measured"
-    pulls = {axis: held.imu[f"a{axis}"][0] for axis in "xyz"}
-    assert first["/imu/drone"][1]["linear_acceleration"] == pulls
+    assert first["/imu/drone"][1]["linear_acceleration"] == {axis: held.imu[f"a{axis}"][0] for axis in "xyz"}
     assert first["/height/drone"][1]["height_m"] == held.height["height_m"][0]
     celsius = [set(content) for _, topic, _, content in messages if topic == "/temperature/2"]
     assert celsius == [{"timestamp", "temperature_c", "supply_v"}, {"timestamp", "temperature_c"}]

@@ -1,4 +1,6 @@
-"""Bags with topics of ranges: guessed and imported without other files, and notes on their poses."""
+"""Bags of ROS 1, ROS 2 and MCAP with message types defined here: topics of ranges, which are guessed and imported
+without other files, notes on their poses, and exchanges by a map of their fields.
+"""
 
 import json
 import sqlite3
@@ -9,40 +11,100 @@ import pytest
 
 from tests import processes
 from tests.errors import one_line
-from tests.uwblink.importers.test_exchange_bags import TICK_M, header, ros1, ros2, store_of
 from tests.uwblink.importers.test_forms import PLANT, ROUNDS
-from uwblink.errors import ImportTableError
-from uwblink.exporters import export_recording
-from uwblink.importers import read_source
+from uwblink.errors import ArgumentError, ImportTableError
+from uwblink.importers import import_recording, read_source
 from uwblink.importers.guess import guess_map
-from uwblink.recording.contents import Contents, load
-from uwblink.recording.schema import Poses, Tag
-from uwblink.twr import Exchanges
+from uwblink.recording.contents import load
 
 pytest.importorskip("rosbags", reason="the extra uwbcal[bags] is not installed")
+from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
-from rosbags.typesys import get_types_from_msg
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+EXCHANGE = "std_msgs/Header header\nuint16 a\nuint16 b\nuint64[6] stamps\nfloat32 power\nfloat64 odd\n"
+ONE_OF_LIST = "string anchor\nfloat64 distance\nfloat32 rssi\n"
+ARRAY = "std_msgs/Header header\nuint16 tag\nfloat32[8] dis_arr\n"
+LISTS = "std_msgs/Header header\nuwb_msgs/Range[] ranges\n"
+MINES = "std_msgs/Header header\nstring dest\nfloat32 range_mm\nfloat32 rssi\n"
+STAMPS = "std_msgs/Header header\nuint16 src\nuint16 dst\nuint64 tx1\nuint64 rx1\nuint64 tx2\nuint64 rx2\n"
+TYPES = {"Exchange": EXCHANGE, "Range": ONE_OF_LIST, "Ranges": LISTS, "Array": ARRAY, "Mine": MINES, "Stamped": STAMPS}
+TICK_M = 299_702_547.0 / (128 * 499_200_000)
+WHEN = 1_706_822_508_042_560_815
+
+
+def truths(count=40):
+    random = np.random.default_rng(8)
+    for k in range(count):
+        flight, reply, later = (
+            int(v) for v in random.integers([200, 2 * 10**7, 8 * 10**7], [3000, 4 * 10**7, 9 * 10**7])
+        )
+        mine, other = (int(v) for v in random.integers(2**40, size=2))
+        tx2, rx2 = other + flight + reply, mine + 2 * flight + reply
+        stamps = [mine, other + flight, tx2, rx2, tx2 + later, rx2 + later]
+        yield WHEN + k * 10**7, (4, 9) if k % 2 else (9, 7), [s % 2**40 for s in stamps], flight * TICK_M
+
+
+def store_of(kind):
+    store = get_typestore(kind)
+    for name, text in TYPES.items():
+        store.register(get_types_from_msg(text, f"uwb_msgs/msg/{name}"))
+    return store
+
+
+def header(store, time_ns, *first):
+    types = store.types
+    stamp = types["builtin_interfaces/msg/Time"](*divmod(time_ns, 10**9))
+    return types["std_msgs/msg/Header"](*first, stamp, "map")
+
+
+def ros2(path, topics, plugin=StoragePlugin.MCAP):
+    store = store_of(Stores.ROS2_JAZZY)
+    with Writer2(path, version=9, storage_plugin=plugin) as bag:
+        for topic, (kind, make) in topics.items():
+            connection = bag.add_connection(topic, kind, typestore=store)
+            for time_ns, message in make(store, ()):
+                bag.write(connection, time_ns, store.serialize_cdr(message, kind))
+    return path
+
+
+def ros1(path, topics):
+    store = store_of(Stores.ROS1_NOETIC)
+    with Writer1(path) as bag:
+        for topic, (kind, make) in topics.items():
+            connection = bag.add_connection(topic, kind, typestore=store)
+            for time_ns, message in make(store, (0,)):
+                bag.write(connection, time_ns, store.serialize_ros1(message, kind))
+    return path
+
+
+def exchanges(store, first):
+    for time_ns, (a, b), stamps, _ in truths():
+        head = header(store, time_ns, *first)
+        kind = store.types["uwb_msgs/msg/Exchange"]
+        yield time_ns + 5, kind(head, a, b, np.array(stamps, dtype=np.uint64), -80.5, float("nan"))
+
+
+def pairs_of_ranges(store, first):
+    for time_ns, (a, b), _, truth in truths():
+        one = store.types["uwb_msgs/msg/Range"]
+        listed = [one(f"anchor{a}", truth * 100, -79.5), one(f"anchor{b}", truth * 200, -78.5)]
+        yield time_ns, store.types["uwb_msgs/msg/Ranges"](header(store, time_ns, *first), listed)
+
+
+EXCHANGES = {"/uwb": ("uwb_msgs/msg/Exchange", exchanges)}
+RANGED = {"/tag/ranges": ("uwb_msgs/msg/Ranges", pairs_of_ranges), **EXCHANGES}
+NAMED = "\n".join(f'{name} = "stamps.{k}"' for k, name in enumerate(("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")))
+
+
+# Topics of ranges.
+
 
 START = 1_706_822_508_000_000_000
 RANGE, NUMBER, TEXT = "sensor_msgs/msg/Range", "std_msgs/msg/Float32", "std_msgs/msg/String"
 MINE, POSE = "uwb_msgs/msg/Mine", "geometry_msgs/msg/PoseStamped"
-HEADER, STAMPED = "std_msgs/Header header\n", "uwb_msgs/msg/Stamped"
-
-
-@pytest.fixture(autouse=True)
-def own_types(monkeypatch):
-    """Two more message types, in addition to those of bags with exchanges."""
-
-    def with_more(kind):
-        store = store_of(kind)
-        store.register(
-            get_types_from_msg("std_msgs/Header header\nstring dest\nfloat32 range_mm\nfloat32 rssi\n", MINE)
-        )
-        ids, stamps = "uint16 src\nuint16 dst\n", "".join(f"uint64 {n}\n" for n in ("tx1", "rx1", "tx2", "rx2"))
-        store.register(get_types_from_msg(f"{HEADER}{ids}{stamps}", STAMPED))
-        return store
-
-    monkeypatch.setattr("tests.uwblink.importers.test_exchange_bags.store_of", with_more)
+STAMPED = "uwb_msgs/msg/Stamped"
 
 
 def by_map(tmp_path, bag, text):
@@ -189,8 +251,7 @@ def test_both_ids_in_names_of_topics_may_be_words(tmp_path):
 def test_ids_in_names_of_topics_complete_those_in_messages(tmp_path):
     """Or the id in the names; an id of a robot differs from an id of the anchors in its messages."""
     topics = {f"/robot{k}/uwb": (MINE, of_anchor(k, as_mine)) for k in range(4)}
-    found = by_guess(tmp_path, ros2(tmp_path / "fields", topics))
-    assert set(ends(found)) == {(f"robot{k}", k) for k in range(4)}
+    assert set(ends(by_guess(tmp_path, ros2(tmp_path / "fields", topics)))) == {(f"robot{k}", k) for k in range(4)}
     bag = ros2(tmp_path / "range", by_anchor("/tag1{}/range", RANGE, as_range))
     assert set(ends(by_guess(tmp_path, bag, ("to_id",)))) == {(10, 7), (11, 7), (12, 7), (13, 7)}
 
@@ -225,35 +286,6 @@ def test_a_template_of_topics_in_a_map(tmp_path):
     ):
         with pytest.raises(ImportTableError, match=said):
             by_map(tmp_path, bag, f'[topics."{topic}"]\n{keys}')
-
-
-@pytest.fixture
-def recorded(tmp_path):
-    """A recording of two pairs with powers, and one moving body, in simulated time."""
-    n, random = 60, np.random.default_rng(5)
-    tx1, flight = np.arange(n) * 10**7, random.integers(100, 3000, n)
-    e = Exchanges.from_arrays(
-        np.where(np.arange(n) % 2, 1, 3), np.full(n, 2), time_ns=10**9 + np.arange(n) * 10**8,
-        tx1=tx1, rx1=tx1 + flight, tx2=tx1 + flight + 10**6, rx2=tx1 + 2 * flight + 10**6,
-        fpp1_dbm=random.normal(-85, 3, n), fpp2_dbm=np.where(np.arange(n) < 30, np.nan, -84.5),
-        skew1_ppm=random.normal(size=n),
-    )  # fmt: skip
-    places = np.column_stack([np.arange(n) / 10, np.zeros((n, 2))])
-    poses = Poses(e.time_ns, np.full(n, "drone"), places, np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)))
-    held = Contents(exchanges=e, poses=poses, tags=[Tag(k, f"tag{k}", (0.0, 0.0, 0.0)) for k in (1, 2, 3)])
-    held.save(tmp_path / "r.uwb")
-    return held
-
-
-@pytest.mark.parametrize("to", ["rosbag2", pytest.param("mcap", marks=pytest.mark.slow)])
-def test_our_own_bags_come_in_without_a_map_and_with_powers(tmp_path, recorded, to):
-    export_recording(tmp_path / "r.uwb", tmp_path / "out", to=to)
-    bag = tmp_path / "out" / ("rosbag2" if to == "rosbag2" else "recording.mcap")
-    found = read_source(bag, importer="bag").exchanges
-    for name in ("time_ns", "initiator", "target", "range_m", "truth_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(recorded.exchanges, name), err_msg=name)
-    e = by_guess(tmp_path, bag).exchanges
-    np.testing.assert_array_equal([e.time_ns, e.fpp1_dbm], [found.time_ns, found.fpp1_dbm])
 
 
 def test_topics_named_as_ours_need_no_map(tmp_path):
@@ -329,3 +361,61 @@ def test_without_the_extra_the_error_names_the_package_to_install(tmp_path, monk
     monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
     with pytest.raises(ImportTableError, match=r"pip install 'uwbcal\[bags\]'"):
         guess_map(bag)
+
+
+# Exchanges by a map of the fields of messages.
+
+
+@pytest.mark.parametrize("write", [ros1, ros2])
+def test_exchanges_by_the_fields_of_a_message(tmp_path, write):
+    bag = write(tmp_path / ("b.bag" if write is ros1 else "b"), EXCHANGES)
+    found = by_map(tmp_path, bag, f'[columns]\nfrom_id = "a"\nto_id = "b"\nfpp1 = "power"\nfpp2 = "odd"\n{NAMED}\n')
+    e, expected = found.exchanges, list(truths())
+    count = import_recording(bag, tmp_path / "o.uwb", importer="bag", map_file=tmp_path / "map.toml")
+    assert count == len(e) == len(expected)
+    assert e.time_ns.tolist() == [row[0] for row in expected], "to the nanosecond"
+    assert list(zip(e.initiator.tolist(), e.target.tolist(), strict=True)) == [row[1] for row in expected]
+    assert (e.bits, set(e.protocol), set(e.fpp1_dbm)) == (40, {"ds"}, {-80.5})
+    assert np.isnan(e.fpp2_dbm).all()
+    np.testing.assert_allclose(e.range_m, [row[3] for row in expected], atol=1e-9)
+    assert (found.meta["source"], found.meta["imported_from"]) == ("import bag", bag.name)
+
+
+def test_a_list_of_ranges_in_each_message_of_one_topic_of_several(tmp_path):
+    text = 'each = "ranges"\n[topics."/tag/ranges"]\nfrom_id = "drone"\n[units]\ndistance = "cm"\n'
+    text += '[columns]\nto_id = "ranges.anchor"\nrange_m = "ranges.distance"\nrxp2 = "ranges.rssi"\n'
+    found = by_map(tmp_path, ros2(tmp_path / "b", RANGED), text)
+    expected = [factor * row[3] for row in truths() for factor in (1, 2)]
+    np.testing.assert_allclose(found.exchanges.range_m, expected, rtol=1e-12)
+    assert set(found.meta["tag_names"].values()) == {"drone", "anchor4", "anchor7", "anchor9"}
+    assert found.powers["rxp2_dbm"][:2].tolist() == [-79.5, -78.5]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", r"`map_file` must name the topics.*there are /tag/ranges \(uwb_msgs/msg/Ranges\), /uwb"),
+        ('[topics."/none"]\n', "no topic '/none'; there are /tag/ranges"),
+        ('each = "ranges"\n[topics."/uwb"]\n', "a message of /uwb has no list 'ranges'"),
+        ('[topics."/uwb"]\n', "column 'from_id' is missing; there are header.stamp, header.frame_id, a, b, stamps"),
+        ('[topics."/uwb"]\nfrom_id = [1]\n', r"topics\./uwb\.from_id"),
+        ("each = 3\n", "each: found 3"),
+    ],
+)
+def test_missing_topics_and_fields_are_named(tmp_path, text, said):
+    with pytest.raises(ImportTableError, match=said):
+        by_map(tmp_path, ros2(tmp_path / "b", RANGED), text)
+
+
+def test_other_files_than_bags_are_refused(tmp_path):
+    (tmp_path / "no.bag").write_bytes(b"nothing")
+    (tmp_path / "folder").mkdir()
+    for name, more, said in (
+        ("no.bag", {}, "cannot be read as a bag"),
+        ("folder", {"importer": "bag"}, "cannot be read as a bag"),
+        ("absent.mcap", {}, "no such bag"),
+    ):
+        with pytest.raises(ImportTableError, match=said):
+            read_source(tmp_path / name, **more)
+    with pytest.raises(ArgumentError, match="needs one file, found 2"):
+        read_source([tmp_path / "no.bag"] * 2, importer="bag")

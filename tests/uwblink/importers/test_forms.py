@@ -173,16 +173,13 @@ def with_sentinels(value):
 
 
 def shuffled():
-    rows = long_rows()
-    return [rows[k] for k in np.random.default_rng(1).permutation(len(rows))]
+    return np.random.default_rng(1).permutation(long_rows()).tolist()
 
 
 def by_both():
     """Return each range twice, from the log of the tag and, 2 ms later, from that of the anchor."""
-    rows = []
-    for row in long_rows():
-        rows += [row, row | {"tag": row["anchor"], "anchor": 7, "t_s": row["t_s"] + 0.002}]
-    return renamed({"tag": "src", "anchor": "dst"}, rows)
+    both = ([row, row | {"tag": row["anchor"], "anchor": 7, "t_s": row["t_s"] + 0.002}] for row in long_rows())
+    return renamed({"tag": "src", "anchor": "dst"}, [row for rows in both for row in rows])
 
 
 def renamed(names, rows=None):
@@ -449,11 +446,6 @@ def test_positions_have_units(tmp_path):
     assert found.range_m == pytest.approx([2 + 0.007 * k for k in range(30)])
     assert found.time_ns.tolist() == [k * 500_000_000 for k in range(30)]
     assert (set(found.initiator), set(found.truth_m)) == ({7}, {2.5})
-
-
-def test_a_table_without_a_header_is_refused_with_that_reason(tmp_path):
-    with pytest.raises(ImportTableError, match=r"its first line is a row.* from_id = 2"):
-        imported(tmp_path, "".join(f"{k},1,2,{3 + k / 7:.3f}\n" for k in range(30)))
 
 
 @pytest.mark.parametrize("third", ["initiator", "target"])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.errors import one_line
+from tests.uwblink.importers.test_bag_guess import by_guess
 from uwblink.errors import ImportTableError
 from uwblink.exporters import export_recording
 from uwblink.importers import read_source
@@ -37,17 +38,21 @@ def exported(tmp_path):
     )  # fmt: skip
     held = Contents(exchanges=exchanges, poses=poses)
     held.save(tmp_path / "r.uwb")
-    export_recording(tmp_path / "r.uwb", tmp_path / "out", to="mcap")
-    return held, tmp_path / "out" / "recording.mcap"
+    for to in ("mcap", "rosbag2"):
+        export_recording(tmp_path / "r.uwb", tmp_path / to, to=to)
+    return held, tmp_path / "mcap" / "recording.mcap"
 
 
-def test_exported_ranges_are_imported_without_a_map(exported):
-    held, path = exported
-    found = read_source(path).exchanges
+@pytest.mark.parametrize("name", ["mcap/recording.mcap", "rosbag2/rosbag2"])
+def test_exported_ranges_are_imported_without_a_map_and_by_the_guess(exported, tmp_path, name):
+    """They have distances and powers; the map that is guessed has no distances."""
+    held, found = exported[0].exchanges, read_source(tmp_path / name, importer="bag").exchanges
     names = "time_ns initiator target range_m truth_m fpp1_dbm fpp2_dbm skew1_ppm skew2_ppm"
-    for name in names.split():
-        np.testing.assert_array_equal(getattr(found, name), getattr(held.exchanges, name), err_msg=name)
+    for column in names.split():
+        np.testing.assert_array_equal(getattr(found, column), getattr(held, column), err_msg=column)
     assert not found.tx1.any()
+    e = by_guess(tmp_path, tmp_path / name).exchanges
+    np.testing.assert_array_equal([e.time_ns, e.fpp1_dbm], [held.time_ns, held.fpp1_dbm])
 
 
 def test_exported_poses_are_imported(exported):

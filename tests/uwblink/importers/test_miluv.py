@@ -94,8 +94,7 @@ def flight(tmp_path):
 
 def imported(folder, tmp_path, text=""):
     (tmp_path / "map.toml").write_text(text)
-    map_file = tmp_path / "map.toml" if text else None
-    import_recording(folder, tmp_path / "o.uwb", importer="miluv", map_file=map_file)
+    import_recording(folder, tmp_path / "o.uwb", importer="miluv", map_file=tmp_path / "map.toml" if text else None)
     return load(tmp_path / "o.uwb")
 
 

@@ -102,8 +102,7 @@ def vicon(folder, unit="rad", quaternions=False):
 def qualisys(folder, time=True):
     def numbers(name, k):
         turned = BODIES[name][1][k]
-        by_column = turned.as_matrix().T.ravel()
-        return [*BODIES[name][0][k] * 1000, *turned.as_euler("xyz", degrees=True), 0.4, *by_column]
+        return [*BODIES[name][0][k] * 1000, *turned.as_euler("xyz", degrees=True), 0.4, *turned.as_matrix().T.ravel()]
 
     words = ["Roll", "Pitch", "Yaw", "Residual", *(f"Rot[{k}]" for k in range(9))]
     head = [

@@ -7,15 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-import uwblink
 import uwbsim
 from tests import processes
 from tests.errors import one_line
 from uwblink.errors import ImportTableError, PlanError, RecordingExistsError
+from uwblink.exporters import export_recording
 from uwblink.importers import add_poses
 from uwblink.importers.poses import read_poses
-from uwblink.recording.contents import Contents
-from uwblink.recording.schema import Tag
+from uwblink.recording.contents import Contents, load
+from uwblink.recording.distances import distances_m
+from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import STAMPS, Exchanges
 from uwbsim.boards.server import LivePoses
 from uwbsim.world.world import World
@@ -112,15 +113,15 @@ def test_auto_finds_the_offset_from_the_ranges(flight, copied):
     # A drone at 1 m/s moves 5 mm in 5 ms; 1500 ranges of 10 cm determine a shift of that size.
     assert found.offset_s == pytest.approx(-3.210, abs=0.015)
     assert found.covered > 0.95 * found.exchanges
-    held = uwblink.load(copied)
+    held = load(copied)
     assert (len(held.poses), held.meta["poses_offset_s"]) == (found.poses, pytest.approx(found.offset_s))
 
 
 def test_the_command_prints_its_result_and_refuses_wrong_options(flight, copied, tmp_path):
     said = processes.run("uwblink", "poses", copied, "--from", flight / "p.csv", "--offset", "-3.21").stdout
     assert "1660 of 1660 measurements have a true distance" in said
-    done = processes.run("uwblink", "poses", copied, "--from", flight / "p.csv", "--offset", "soon", "--force")
-    assert (done.returncode, done.stderr.count("\n"), "--offset" in done.stderr) == (2, 1, True)
+    words = ("poses", copied, "--from", flight / "p.csv", "--force")
+    processes.refuse("uwblink", *words, "--offset", "soon", naming=["--offset"])
     for more, error, fragment in (
         ({"source": tmp_path / "no.csv"}, ImportTableError, "no such file"),
         ({"offset": "500000"}, ImportTableError, "no exchange is within"),
@@ -143,7 +144,7 @@ def scaled(path, factor, output):
 def test_existing_poses_are_replaced_only_with_force(flight, copied):
     for offset, force in (("-3.21", False), ("-3.1", True)):
         add_poses(copied, flight / "p.csv", offset=offset, force=force)
-        assert uwblink.load(copied).meta["poses_offset_s"] == pytest.approx(float(offset))
+        assert load(copied).meta["poses_offset_s"] == pytest.approx(float(offset))
         with pytest.raises(RecordingExistsError, match="`force` replaces them"):
             add_poses(copied, flight / "p.csv", offset="-3")
 
@@ -167,7 +168,7 @@ def test_poses_in_other_units_are_refused(flight, copied, tmp_path, unit, factor
 
 
 def test_lever_arms_and_ranges_in_other_units_are_refused(flight, copied, tmp_path):
-    whole = uwblink.load(copied)
+    whole = load(copied)
     tags, held = whole.tags, whole.exchanges
     tables = [
         f'[[tags]]\nid = {tag.tag}\nbody = "{tag.body}"\nlever_arm_m = {[1000 * x for x in tag.lever_arm_m]}\n'
@@ -198,3 +199,128 @@ def test_boards_that_stand_still_are_not_taken_for_ranges_in_another_unit(tmp_pa
     rows = [f"{t},{body},{x},0,0,0,0,0,1" for t in (-1, 3) for body, x in (("left", 0.0), ("right", 3.0))]
     (tmp_path / "p.csv").write_text("time_s,body,x,y,z,qx,qy,qz,qw\n" + "\n".join(rows) + "\n")
     assert add_poses(tmp_path / "still.uwb", tmp_path / "p.csv").covered == count
+
+
+# Poses as written by drivers of motion capture: messages, topics, several files, anchors.
+
+
+TURNED = [0.0, 0.0, 0.6, 0.8]
+
+
+def bag(path, messages):
+    """Write a ROS 2 bag of (topic, kind, position, frame) at seconds 0, 1, 2."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="the extra uwbcal[bags] is not installed")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    t = {name.split("/")[-1]: kind for name, kind in store.types.items()}
+    turned, uncertain = t["Quaternion"](*TURNED), "PoseWithCovarianceStamped"
+
+    def made(kind, k, place, frame):
+        header = t["Header"](t["Time"](k, 500), "world")
+        pose = t["Pose"](t["Point"](place + k, 2.0, 3.0), turned)
+        with_covariance = t["PoseWithCovariance"](pose, np.zeros(36))
+        still = t["TwistWithCovariance"](t["Twist"](t["Vector3"](0, 0, 0), t["Vector3"](0, 0, 0)), np.zeros(36))
+        transform = t["TransformStamped"](header, frame, t["Transform"](t["Vector3"](place + k, 2.0, 3.0), turned))
+        return {
+            "geometry_msgs/msg/PoseStamped": lambda: t["PoseStamped"](header, pose),
+            f"geometry_msgs/msg/{uncertain}": lambda: t[uncertain](header, with_covariance),
+            "nav_msgs/msg/Odometry": lambda: t["Odometry"](header, frame, with_covariance, still),
+            "geometry_msgs/msg/TransformStamped": lambda: transform,
+            "tf2_msgs/msg/TFMessage": lambda: t["TFMessage"]([transform]),
+        }[kind]()
+
+    with rosbag2.Writer(path, version=9) as writer:
+        for topic, kind, place, frame in messages:
+            connection = writer.add_connection(topic, kind, typestore=store)
+            for k in range(3):
+                writer.write(connection, k * 10**9, store.serialize_cdr(made(kind, k, place, frame), kind))
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind", "frame"),
+    [
+        ("/vrpn_mocap/drone/pose", "geometry_msgs/msg/PoseStamped", ""),
+        ("/mocap/rigid_bodies/drone/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", ""),
+        ("/qualisys/drone/odom", "nav_msgs/msg/Odometry", "base"),
+        ("/vicon/anything", "geometry_msgs/msg/TransformStamped", "vicon/drone/drone"),
+        ("/tf", "tf2_msgs/msg/TFMessage", "drone"),
+    ],
+)
+def test_every_kind_of_message(tmp_path, topic, kind, frame):
+    bag(tmp_path / "bag", [(topic, kind, 5.0, frame)])
+    poses = read_poses(tmp_path / "bag")
+    assert (poses.body.tolist(), poses.time_ns.tolist()) == (["drone"] * 3, [500, 1_000_000_500, 2_000_000_500])
+    assert poses.position_m.tolist() == [[5.0, 2.0, 3.0], [6.0, 2.0, 3.0], [7.0, 2.0, 3.0]]
+    np.testing.assert_allclose(poses.quaternion, [TURNED] * 3)
+
+
+def test_topics_by_body(tmp_path):
+    pose, odometry = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry"
+    bag(tmp_path / "bag", [("/a/pose", pose, 1.0, ""), ("/b/pose", pose, 2.0, ""), ("/c/odom", odometry, 3.0, "x")])
+    assert set(read_poses(tmp_path / "bag").body) == {"a", "b"}
+    poses = read_poses(tmp_path / "bag", topics={"drone": "/b/pose", "car": "/c/odom"})
+    assert [poses[poses.body == body].position_m[0, 0] for body in ("drone", "car")] == [2.0, 3.0]
+    (tmp_path / "t.tum").write_text("0 1 2 3 0 0 0 1\n")
+    for name, said in (
+        ("bag", "'/d' is not there; topics with poses are /a/pose, /b/pose, /c/odom"),
+        ("t.tum", "has no topics"),
+    ):
+        with pytest.raises(ImportTableError, match=said):
+            read_poses(tmp_path / name, topics={"drone": "/d"})
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """A recording of tag 1 on a car, 2 on a drone and anchor 9, and a trajectory of each body in our format."""
+    ids = np.array([[1, 2], [1, 9], [2, 9]] * 5)
+    when = np.arange(15) * 100_000_000
+    e = Exchanges.from_arrays(ids[:, 0], ids[:, 1], time_ns=when, tx1=[0] * 15, rx1=5, tx2=1005, rx2=3000)
+    tags = [Tag(k, body, (0.0, 0.0, 0.0)) for k, body in ((1, "car"), (2, "drone"), (9, "tag9"))]
+    for body, x in (("car", 0.0), ("drone", 4.0)):
+        poses = Poses.from_arrays(np.arange(20) * 10**8, body, [[x, 0.0, k / 10] for k in range(20)])
+        Contents(exchanges=e, poses=poses).save(tmp_path / "one.uwb", force=True)
+        export_recording(tmp_path / "one.uwb", tmp_path / body, to="tum")
+    Contents(exchanges=e, tags=tags).save(tmp_path / "r.uwb")
+    return tmp_path / "r.uwb"
+
+
+def test_bodies_without_poses_are_named_whether_some_or_no_ranges_have_both_ends(recording, tmp_path):
+    """Of the pairs 1-2, 1-9 and 2-9, car and drone have poses, or none."""
+    places, files = tmp_path / "places.toml", ["--from", f"car={tmp_path / 'car' / 'car.tum'}"]
+    done = processes.run("uwblink", "poses", recording, *files, "--from", f"drone={tmp_path / 'drone' / 'drone.tum'}")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "5 of 15 measurements have a true distance; no poses of tag9" in done.stdout
+    places.write_text("".join(f'[[tags]]\nid = {k}\nbody = "{name}"\n' for k, name in ((1, "Car"), (2, "car"))))
+    said = "bodies are car, but those of the tags are Car, car; give the bodies of tags 9, which range,"
+    words = ("poses", recording, *files, "--tags", places, "--offset", "auto", "--force")
+    processes.refuse("uwblink", *words, naming=[said])
+
+
+def test_trajectories_of_several_bodies_and_anchors(recording, tmp_path):
+    (tmp_path / "places.toml").write_text("[[anchors]]\nid = 9\nposition_m = [0.0, 3.0, 0.0]\n")
+    files = {body: tmp_path / body / f"{body}.tum" for body in ("car", "drone")}
+    found = add_poses(recording, files, tags_from=tmp_path / "places.toml")
+    assert (found.bodies, found.covered, found.exchanges) == (("anchor9", "car", "drone"), 15, 15)
+    held = load(recording)
+    assert {tag.tag: tag.body for tag in held.tags} == {1: "car", 2: "drone", 9: "anchor9"}
+    assert (held.poses.body == "anchor9").sum() == 1
+    e = held.exchanges
+    true_m = distances_m(held.poses, held.tags, e.initiator, e.target, e.time_ns)
+    np.testing.assert_allclose(true_m[:2], [4.0, np.hypot(3.0, 0.1)])
+
+
+def test_wrong_anchors_are_refused(recording, tmp_path):
+    for text, fragment in (
+        ("[[anchors]]\nid = 9\n", "anchors[0].position_m"),
+        ("[[anchors]]\nid = 9\nposition_m = [1, 2]\n", "three numbers"),
+        ("[[anchors]]\nid = 9\nposition_m = [1, 2, 3]\n" * 2, "found 9, expected another id"),
+        ("[[anchors]]\nid = 9\nposition_m = [1, 2, 3]\ncovariance_m2 = [1.0]\n", "six numbers"),
+        ("[[anchors]]\nid = 9\nplace = [1, 2, 3]\n", "unknown key"),
+        ("anchors = 3\n", "expected tables [[anchors]]"),
+        ("a = 3\n", "a: unknown key"),
+    ):
+        (tmp_path / "places.toml").write_text(text)
+        with pytest.raises(PlanError, match=one_line(fragment)):
+            add_poses(recording, tmp_path / "car" / "car.tum", body="car", tags_from=tmp_path / "places.toml")
+    assert not load(recording).poses

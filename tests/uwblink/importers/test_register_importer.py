@@ -1,12 +1,12 @@
 """A registered importer: from Python and from the command line, and errors."""
 
-from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.processes import succeed
+from tests.registered import registered
 from uwblink.errors import ArgumentError, ImportTableError, RecordingExistsError
 from uwblink.importers import IMPORTERS, Importer, import_recording, register_importer
 from uwblink.recording.contents import Contents, load
@@ -25,21 +25,10 @@ def read_blanks(source, map_file):
 BLANKS = Importer("blanks", (".ranges", ".ranges.txt"), read_blanks, "Import six numbers a line.", "What they mean.")
 
 
-@contextmanager
-def registered(**changes):
-    """Register an importer like BLANKS, and remove it afterwards."""
-    changed = replace(BLANKS, **changes)
-    register_importer(changed)
-    try:
-        yield
-    finally:
-        IMPORTERS.remove(changed.name)
-
-
 @pytest.fixture
 def source(tmp_path):
     (tmp_path / "my.Ranges").write_text("1 2 0 5 1005 3000\n2 3 9 3 1003 3009\n")
-    with registered():
+    with registered(IMPORTERS, BLANKS):
         yield tmp_path / "my.Ranges"
 
 
@@ -53,12 +42,12 @@ def test_registered_importers_are_found_by_suffix_and_name(source, tmp_path):
 
 def test_the_longest_ending_decides(tmp_path):
     (tmp_path / "my.blanks.csv").write_text("1 2 0 5 1005 3000\n")
-    with registered(suffixes=(".blanks.csv",)):
+    with registered(IMPORTERS, replace(BLANKS, suffixes=(".blanks.csv",))):
         assert import_recording(tmp_path / "my.blanks.csv", tmp_path / "a.uwb") == 1
 
 
 def test_without_a_map_there_is_no_option_for_one(tmp_path):
-    with registered(name="plain", map_help=None):
+    with registered(IMPORTERS, replace(BLANKS, name="plain", map_help=None)):
         assert "--map" not in succeed("uwblink", "import", "plain", "--help").stdout
         with pytest.raises(ArgumentError, match="`map_file`: importer 'plain' uses none"):
             import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb", importer="plain", map_file=tmp_path / "m")
@@ -95,6 +84,7 @@ def test_wrong_importers_are_refused(change, expected):
 
 
 def test_a_reader_must_return_contents(tmp_path):
-    broken = pytest.raises(ArgumentError, match=r"importer 'broken': returned \[1, 2\], expected Contents")
-    with registered(name="broken", read=lambda _source, _map: [1, 2]), broken:
+    broken = replace(BLANKS, name="broken", read=lambda *_: [1, 2])  # type: ignore[arg-type]
+    said = pytest.raises(ArgumentError, match=r"importer 'broken': returned \[1, 2\], expected Contents")
+    with registered(IMPORTERS, broken), said:
         import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb")

@@ -28,14 +28,6 @@ def test_the_same_stamps_of_the_same_devices_are_one_exchange(tmp_path):
     assert columns == tuple([row[name] for row in rows] for name in ("tx1", "fpp1"))
 
 
-def test_logs_in_files_of_their_own(tmp_path):
-    rows = wrapped(flights(90))
-    found = read_table([write(tmp_path / "a.csv", rows[:60]), write(tmp_path / "b.csv", rows[30:])])
-    assert found.exchanges.tx1.tolist() == [row["tx1"] for row in rows]
-    assert found.exchanges.time_ns.tolist() == sorted(found.exchanges.time_ns.tolist())
-    assert any("30 of 120 rows" in note for note in found.meta["notes"])
-
-
 def test_unusable_rows_and_rows_without_stamps_are_no_repetition(tmp_path):
     rows = wrapped(flights(60))
     found = read_rows(tmp_path, [row if k % 7 else row | {"tx2": ""} for k, row in enumerate(rows)])

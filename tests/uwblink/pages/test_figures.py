@@ -99,10 +99,9 @@ def test_pages_have_positions_and_axes_of_panels():
 
 @pytest.mark.parametrize("width", [pytest.param(1280, marks=pytest.mark.slow), 390])
 def test_pages_fit_into_windows(width, tmp_path):
-    header = ["pair", *(f"column {k}" for k in range(20))]
     blocks: list[Block] = [
         Picture("two", two_panels, "A caption. " * 12),
-        Table(header, [["1-2", *("12345.6" for _ in range(20))]] * 3),
+        Table(["pair", *(f"column {k}" for k in range(20))], [["1-2", *("12345.6" for _ in range(20))]] * 3),
         Table(["what", "is"], [["a question " * 9, "an answer " * 9], ["file", "0a" * 32]], words=True),
         Text(f"{'word ' * 60}. {'x' * 90}", "bad"),
         Listing("y" * 300),

@@ -1,12 +1,18 @@
-"""A copy has every row of every table, except those that were replaced."""
+"""Contents of recordings: a copy has every row of every table, except those that were replaced; parts and pieces."""
+
+from dataclasses import replace
+from functools import partial, partialmethod
 
 import duckdb
 import numpy as np
 import pytest
 
 from tests.uwblink.recording.test_file import random_exchanges
+from uwblink import exporters
 from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError
-from uwblink.recording.contents import Contents, load
+from uwblink.exporters import export_recording, mcap
+from uwblink.recording.contents import Contents, exchanges_with_poses, load, pieces
+from uwblink.recording.distances import distances_m
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import TABLES, Arrangement, CirRow, Fault, FrameRow, KnownDistance, Poses, Tag
 from uwblink.twr import Exchanges
@@ -213,3 +219,93 @@ def test_it_prints_itself_on_a_screen():
 def test_wrong_selections_are_refused(wrong, expected):
     with pytest.raises(ArgumentError, match=expected):
         made().select(**wrong)
+
+
+# A recording in pieces: each row once, in order of time over all tables, for any size of the pieces.
+
+
+COUNT = 400
+SPAN_NS = 40_000_000_000
+TAGS = [Tag(1, "drone", (0.1, 0.0, 0.0)), Tag(2, "mast", (0.0, 0.0, 2.0)), Tag(3, "car two", (0.0, 0.2, 0.0))]
+
+
+def contents():
+    """Rows of all tables with a time, not in order of time unless that is required."""
+    rng = np.random.default_rng(1)
+    pairs, time = np.array([(1, 2), (2, 3), (3, 1)])[rng.integers(0, 3, COUNT)], rng.integers(0, SPAN_NS, COUNT)
+    stamps = dict(zip(("tx1", "rx1", "tx2", "rx2"), rng.integers(0, 2**32, (4, COUNT)), strict=True))
+    x = Exchanges.from_arrays(*pairs.T, time_ns=time, range_m=rng.normal(3, 1, COUNT), **stamps)
+    quaternion = rng.normal(size=(900, 4))
+    poses = Poses.from_arrays(
+        np.append(rng.integers(0, SPAN_NS, 899), 5),
+        np.append(np.array(["drone", "car two"])[rng.integers(0, 2, 899)], "mast"),
+        rng.normal(size=(900, 3)),
+        quaternion / np.linalg.norm(quaternion, axis=1)[:, None],
+    )
+    some, bodies = np.sort(rng.integers(0, SPAN_NS, 300)), np.full(300, "drone")
+    ends = {"time_ns": x.time_ns, "initiator": x.initiator, "target": x.target}
+    values = ("sigma_m", "sigma_total_m", "mean_error_m", "tail_share", "tail_probability")
+    others = dict.fromkeys(values, x.range_m * 0) | dict.fromkeys(("clamped", "outlier"), np.zeros(COUNT, dtype=bool))
+    return Contents(
+        exchanges=x,
+        tags=TAGS,
+        poses=poses,
+        imu={
+            "time_ns": some,
+            "body": bodies,
+            **{n: rng.normal(size=300) for n in ("wx", "wy", "wz", "ax", "ay", "az")},
+        },
+        height={"time_ns": some, "body": bodies, "height_m": rng.normal(size=300)},
+        temperature={"time_ns": some, "tag": np.full(300, 1), "temperature_c": some * 1e-9, "supply_v": some * 0.0},
+        corrected=ends | {"raw_m": x.range_m, "corrected_m": x.range_m - 0.1} | others,
+        faults=[Fault(int(t), "1", "time-out", f"at {t}") for t in rng.integers(0, SPAN_NS, 50)],
+    )
+
+
+@pytest.fixture
+def timed(tmp_path):
+    contents().save(tmp_path / "r.uwb")
+    return tmp_path / "r.uwb"
+
+
+def test_corrections_of_other_exchanges_are_left_out(tmp_path):
+    held = contents()
+    target = np.where(np.arange(COUNT) == 7, 9, held.exchanges.target)
+    replace(held, corrected={**held.corrected, "target": target}).save(tmp_path / "r.uwb")
+    with Recording.open(tmp_path / "r.uwb") as recording:
+        assert all(not held.corrected for held in pieces(recording, 50))
+
+
+@pytest.mark.parametrize(
+    ("to", "module"), [("mcap", mcap), ("tum", exporters), pytest.param("rosbag2", mcap, marks=pytest.mark.slow)]
+)
+def test_an_export_does_not_depend_on_the_pieces(timed, tmp_path, monkeypatch, to, module):
+    as_one = export_recording(timed, tmp_path / "one", to=to)
+    monkeypatch.setattr(module, "pieces", partial(pieces, rows=120))
+    assert export_recording(timed, tmp_path / "many", to=to) == as_one
+    files = [sorted(p for p in (tmp_path / name).rglob("*") if p.is_file()) for name in ("one", "many")]
+    assert len(files[0]) == len(files[1]) > 0
+    for one, other in zip(*files, strict=True):
+        assert one.name == other.name
+        if one.suffix != ".yaml":
+            assert one.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.parametrize("count", [23, 399])
+def test_exchanges_come_with_the_poses_that_they_need(timed, monkeypatch, count):
+    monkeypatch.setattr(Recording, "exchange_blocks", partialmethod(Recording.exchange_blocks, count))
+    with Recording.open(timed) as recording:
+        x, poses = recording.exchanges(), recording.poses()
+        parts = [
+            distances_m(around, TAGS, part.initiator, part.target, part.time_ns)
+            for part, around in exchanges_with_poses(recording)
+        ]
+    assert len(parts) >= COUNT // count
+    np.testing.assert_array_equal(np.concatenate(parts), distances_m(poses, TAGS, x.initiator, x.target, x.time_ns))
+
+
+def test_a_recording_without_exchanges_has_no_stretches(tmp_path):
+    with Recording.create(tmp_path / "empty.uwb") as recording:
+        assert recording.dividing_times("exchanges", 50) == []
+    with Recording.open(tmp_path / "empty.uwb") as recording:
+        assert recording.show().span_s == 0.0

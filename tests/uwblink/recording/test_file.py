@@ -1,16 +1,22 @@
-"""The recording: data are read as written, and other files are refused."""
+"""The recording: data are read as written, also meanwhile, and other files are refused."""
 
+import json
+import os
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import duckdb
 import numpy as np
 import pytest
 
+from tests import processes
+from tests.boards import record_bench
 from tests.errors import one_line
-from uwblink.errors import RecordingError, RecordingExistsError
+from uwblink import Listener, RangingPlan
+from uwblink.errors import RecordingError, RecordingExistsError, RecordingInUseError, RecordingMissingError
 from uwblink.recording.contents import Contents, load
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import TABLES, CirRow, Fault, Poses, Tag
@@ -45,15 +51,16 @@ def recording(written, tmp_path):
 
 def change(path, *statements):
     with duckdb.connect(str(path)) as db:
-        for statement in statements:
-            db.execute(statement)
+        db.execute(";".join(statements))
 
 
 LATER = ("imu", "height", "powers", "quality", "temperature", "receptions", "differences", "corrected")
 """Tables that files of earlier versions lack."""
 
 
-def test_an_existing_file_is_not_replaced_without_force(recording):
+def test_an_existing_file_is_not_replaced_without_force(recording, tmp_path):
+    with pytest.raises(RecordingMissingError, match="no such recording"):
+        Recording.open(tmp_path / "no.uwb")
     before = recording.read_bytes()
     with pytest.raises(RecordingExistsError, match="or replace it with `force`"):
         Recording.create(recording)
@@ -185,8 +192,7 @@ def test_values_that_do_not_fit_undo_their_transaction(tmp_path, write, expected
 
 @pytest.fixture
 def older(tmp_path):
-    tags = [Tag(1, "drone", (0.0, 0.0, 0.0))]
-    Contents(exchanges=random_exchanges(0), tags=tags).save(tmp_path / "older.uwb")
+    Contents(exchanges=random_exchanges(0), tags=[Tag(1, "drone", (0.0, 0.0, 0.0))]).save(tmp_path / "older.uwb")
     change(tmp_path / "older.uwb", *(f"DROP TABLE {table}" for table in LATER))
     return tmp_path / "older.uwb"
 
@@ -194,11 +200,9 @@ def older(tmp_path):
 def test_tables_that_came_later_are_empty(older):
     with Recording.open(older) as recording:
         for table in LATER:
-            assert recording.count(table) == 0
-            assert {name: len(column) for name, column in recording.columns(table).items()} == dict.fromkeys(
-                TABLES[table], 0
-            )
-            assert recording.show().counts[table] == 0
+            assert recording.count(table) == recording.show().counts[table] == 0
+            lengths = {name: len(column) for name, column in recording.columns(table).items()}
+            assert lengths == dict.fromkeys(TABLES[table], 0)
 
 
 def test_an_older_file_is_copied_and_added_to(older, tmp_path):
@@ -208,5 +212,87 @@ def test_an_older_file_is_copied_and_added_to(older, tmp_path):
     with Recording.open(older, update=True) as recording:
         recording.append("height", height)
     for path, count in ((older, 1), (tmp_path / "copy.uwb", 0)):
-        with Recording.open(path) as recording:
-            assert (recording.tags()[0].body, recording.count("height")) == ("drone", count)
+        found = load(path)
+        assert (found.tags[0].body, found.counts().get("height", 0)) == ("drone", count)
+
+
+# A recording is read by other processes while it is written: they get all committed rows, and leave no files.
+
+
+WRITE = """
+import sys, time, uwblink
+from uwblink.recording.schema import Fault
+with uwblink.Recording.create(sys.argv[1], live=True) as recording:
+    for k in range(50):
+        recording.append("faults", [Fault(k, "1", "kind", f"row {k}")])
+    print("writing", flush=True)
+    time.sleep(60)
+"""
+
+
+class Reader(Listener):
+    """Reads the recording in another process after some number of exchanges, until it has `found` them."""
+
+    def __init__(self, path, at):
+        self.path, self.at, self.turns, self.found = path, at, 0, 0
+
+    def on_turn(self, turn):
+        self.turns += turn.report is not None
+        if self.turns == self.at:
+            until_s = time.monotonic() + 60.0  # the writer commits every 0.1 s, and later under load
+            while self.found != self.at and time.monotonic() < until_s:
+                shown = processes.fork("uwblink", "show", "--json", self.path).stdout
+                self.found = json.loads(shown)["counts"]["exchanges"]
+
+
+def test_another_process_reads_what_is_recorded_so_far(tmp_path):
+    path = tmp_path / "f's.uwb"
+    reader = Reader(path, 100)
+    record_bench(path, RangingPlan(rate_hz=100.0), duration_s=2.0, listeners=[reader])
+    assert reader.found == 100
+    assert [p.name for p in tmp_path.iterdir()] == [path.name], "no copy, no log is left"
+    assert len(load(path).exchanges) > 100
+
+
+@pytest.fixture
+def writer(tmp_path):
+    """Another process that has committed fifty faults, and keeps the recording open."""
+    words = [sys.executable, "-c", WRITE, str(tmp_path / "f.uwb")]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        yield tmp_path / "f.uwb"
+        process.kill()
+
+
+def test_what_any_writer_has_committed_is_read_and_not_updated(writer):
+    with Recording.open(writer) as recording:
+        assert [fault.detail for fault in recording.faults()] == [f"row {k}" for k in range(50)]
+        assert recording.path == writer
+    with pytest.raises(RecordingInUseError, match="has it open; wait"):
+        Recording.open(writer, update=True)
+    assert sorted(p.name for p in writer.parent.iterdir()) == ["f.uwb", "f.uwb.wal"]
+
+
+def test_copied_logs_are_read_up_to_the_last_complete_commit(writer, tmp_path):
+    copy, log = tmp_path / "copy.uwb", (tmp_path / "f.uwb.wal").read_bytes()
+    copy.write_bytes(writer.read_bytes())
+    for share in (0.0, 0.1, 0.5, 0.77, 0.999):
+        (tmp_path / "copy.uwb.wal").write_bytes(log[: int(share * len(log))])
+        with Recording.open(copy) as recording:
+            found = [fault.detail for fault in recording.faults()]
+        assert found == [f"row {k}" for k in range(len(found))]
+        assert abs(len(found) - share * 50) < 10
+
+
+@pytest.mark.parametrize("changing", [True, False])
+def test_failed_copies_are_errors_of_the_reader_only(writer, monkeypatch, changing):
+    def copy(source, _target):
+        if not changing:
+            raise OSError(28, "No space left on device")
+        os.utime(source)
+
+    monkeypatch.setattr("shutil.copyfile", copy)
+    why = "changes faster than it can be copied" if changing else r"cannot be copied \(No space left on device\)"
+    with pytest.raises(RecordingInUseError, match=f"another process is writing it, and it {why}; wait until that"):
+        Recording.open(writer)
+    assert sorted(p.name for p in writer.parent.iterdir()) == ["f.uwb", "f.uwb.wal"]

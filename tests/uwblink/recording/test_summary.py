@@ -82,7 +82,7 @@ TICKS = 128 * 499.2e6
 SKEW_PPM = {1: 0.0, 2: 6.0, 3: -2.5}
 
 
-def exchanges(protocol, sign=1.0, carriers=True, warmer_ppm=0.0):
+def ranged(protocol, sign=1.0, carriers=True, warmer_ppm=0.0):
     """Return ranges of 3 m in both directions in every pair; a stamp is its true time by its own clock."""
     pairs = np.array([(1, 2), (2, 1), (1, 3), (3, 1), (2, 3), (3, 2)] * 20)
     first, second = pairs.T
@@ -102,7 +102,7 @@ def exchanges(protocol, sign=1.0, carriers=True, warmer_ppm=0.0):
 
 @pytest.mark.parametrize("protocol", ["ds", "ds-alt"])
 def test_stamps_and_carriers_give_the_planted_skews(protocol):
-    found = {one.pair: one for one in clock_skews(exchanges(protocol))}
+    found = {one.pair: one for one in clock_skews(ranged(protocol))}
     assert sorted(found) == ["1-2", "1-3", "2-3"]
     for pair, planted in {"1-2": 6.0, "1-3": -2.5, "2-3": -8.5}.items():
         one = found[pair]
@@ -114,25 +114,25 @@ def test_stamps_and_carriers_give_the_planted_skews(protocol):
 
 
 def test_opposite_signs_are_stated():
-    found = clock_skews(exchanges("ds", sign=-1.0))
+    found = clock_skews(ranged("ds", sign=-1.0))
     assert [one.same_sign for one in found] == [False] * 3
     assert "OTHER SIGN in 3 of 3 pairs" in skew_summary(found)
     assert "OTHER SIGN" in str(found[0])
 
 
 def test_carriers_without_readings_are_left_out():
-    (first, *_) = clock_skews(exchanges("ds", carriers=False))
+    (first, *_) = clock_skews(ranged("ds", carriers=False))
     assert (first.carrier_ppm, first.slope, first.same_sign) == (None, None, None)
     assert str(first) == "pair 1-2: +6.00 ppm by the stamps, drift +0.00, carriers not read"
 
 
 def test_drifting_clocks_appear_in_their_pairs():
-    drifts = [one.drift_ppm for one in clock_skews([exchanges("ds"), exchanges("ds", warmer_ppm=1.5)])]
+    drifts = [one.drift_ppm for one in clock_skews([ranged("ds"), ranged("ds", warmer_ppm=1.5)])]
     assert drifts == pytest.approx([0.0, 1.5, 1.5], abs=0.01)
 
 
 def test_single_sided_exchanges_have_no_skews():
-    e = exchanges("ds")
+    e = ranged("ds")
     columns = {name: getattr(e, name) for name in ("tx1", "rx1", "tx2", "rx2")}
     assert clock_skews(Exchanges.from_arrays(e.initiator, e.target, **columns)) == []
 
@@ -148,7 +148,7 @@ def both(tmp_path_factory):
         plan = uwblink.RangingPlan(rate_hz=60.0, target_reports=target_reports)
         lossy = VirtualPorts(bench_scenario(), lost_share=0.1)
         record_bench(folder / f"{name}.board.uwb", plan, lossy, duration_s=2.5)
-        exchanges = exchanges_of(folder / f"{name}.board.uwb")
+        exchanges = uwblink.load(folder / f"{name}.board.uwb").exchanges
         assert len(exchanges) > 100
         measured = replace(exchanges, truth_m=np.full(len(exchanges), 3.0))
         rewritten(folder / f"{name}.board.uwb", folder / f"{name}.uwb", measured)
@@ -160,24 +160,23 @@ def rewritten(source, output, exchanges):
         recording.copy(output, replacing={"exchanges": exchanges})
 
 
-def exchanges_of(path):
-    return uwblink.load(path).exchanges
+@pytest.fixture(scope="module")
+def exchanges(both):
+    return uwblink.load(both / "both.uwb").exchanges
 
 
-def test_each_exchange_is_kept_once(both):
-    exchanges = exchanges_of(both / "both.uwb")
+def test_each_exchange_is_kept_once(both, exchanges):
     found = single_reports(exchanges)
     count = len(set(zip(exchanges.tx1.tolist(), exchanges.rx2.tolist(), strict=True)))
     assert (len(found.exchanges), len(found.differing)) == (count, 0)
     assert found.repeated == len(exchanges) - count > 75
     mine = found.exchanges.reporter == found.exchanges.initiator
     assert mine.all(), "every target's report follows one of the initiator's"
-    one = exchanges_of(both / "one.uwb")
+    one = uwblink.load(both / "one.uwb").exchanges
     assert single_reports(one).exchanges is one
 
 
-def test_target_reports_replace_missing_initiator_reports(both):
-    exchanges = exchanges_of(both / "both.uwb")
+def test_target_reports_replace_missing_initiator_reports(exchanges):
     first = np.argmax(exchanges.reporter == exchanges.target)
     twin = (exchanges.tx1 == exchanges.tx1[first]) & (exchanges.reporter == exchanges.initiator)
     found = single_reports(exchanges[~twin])
@@ -186,22 +185,20 @@ def test_target_reports_replace_missing_initiator_reports(both):
 
 
 @pytest.mark.parametrize("name", ["range_m", "tx1", "tx2", "rx3", "skew2_ppm"])
-def test_differences_of_reports_are_found_in_all_columns(both, name):
-    exchanges = exchanges_of(both / "both.uwb")
+def test_differences_of_reports_are_found_in_all_columns(exchanges, name):
     row = np.flatnonzero(exchanges.reporter == exchanges.target)[7]
-    column = getattr(exchanges, name).copy()
-    column[row] += 1
+    column = getattr(exchanges, name) + (np.arange(len(exchanges)) == row)
     changed = replace(exchanges, **{name: column})
     ((first, second),) = single_reports(changed).differing
-    assert second == row
-    assert differences(changed, first, second) == [f"{name} {column[first]} and {column[row]}"]
+    said = [f"{name} {column[first]} and {column[row]}"]
+    assert (second, differences(changed, first, second)) == (row, said)
 
 
-def test_equal_stamps_of_another_time_are_another_exchange(both):
-    exchanges = single_reports(exchanges_of(both / "both.uwb")).exchanges
-    later = replace(exchanges, reporter=exchanges.target, time_ns=exchanges.time_ns + 70_000_000)
-    columns: dict[str, Any] = {n: np.concatenate([getattr(exchanges, n), getattr(later, n)]) for n in COLUMNS}
-    assert single_reports(replace(exchanges, **columns)).repeated == 0
+def test_equal_stamps_of_another_time_are_another_exchange(exchanges):
+    once = single_reports(exchanges).exchanges
+    later = replace(once, reporter=once.target, time_ns=once.time_ns + 70_000_000)
+    columns: dict[str, Any] = {n: np.concatenate([getattr(once, n), getattr(later, n)]) for n in COLUMNS}
+    assert single_reports(replace(once, **columns)).repeated == 0
 
 
 def test_show_calibration_and_doctor_count_it_once(both):
@@ -216,23 +213,20 @@ def test_show_calibration_and_doctor_count_it_once(both):
     assert not any("contradicting" in finding.fault for finding in examine(both / "both.uwb"))
 
 
-def test_the_doctor_names_reports_that_contradict_each_other(both, tmp_path):
+def test_the_doctor_names_reports_that_contradict_each_other(both, exchanges, tmp_path):
     path = tmp_path / "f.uwb"
-    exchanges = exchanges_of(both / "both.uwb")
     wrong = (exchanges.reporter == exchanges.target) & (exchanges.initiator == 1)
     rewritten(both / "both.uwb", path, replace(exchanges, range_m=exchanges.range_m + wrong))
     with Recording.open(path) as recording:
         assert recording.show().contradictory == np.count_nonzero(wrong)
-    finding = next(f for f in examine(path) if f.fault == "contradicting reports")
-    assert "the first: range_m" in finding.evidence
+    assert "the first: range_m" in next(f for f in examine(path) if f.fault == "contradicting reports").evidence
 
 
 REPORT = RangeReport(2, 3.0, 100, 200, 300, 400, 500, 600, -80.0, -81.0, 1.0, -1.0)
 
 
 def as_target(report, **changes):
-    values = {n: getattr(report, n) for n in RangeReport.FIELDS} | {"neighbour": 1} | changes
-    return TargetRangeReport(**values)
+    return TargetRangeReport(**{n: getattr(report, n) for n in RangeReport.FIELDS} | {"neighbour": 1} | changes)
 
 
 def test_a_recorder_compares_the_two_reports_as_they_come():

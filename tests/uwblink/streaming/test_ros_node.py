@@ -15,30 +15,15 @@ from uwbsim.boards.virtual_board import VirtualPorts
 PAGE = Path(__file__).parents[3] / "docs" / "boards.md"
 
 
-class Stamp:
-    __slots__ = ("nanosec", "sec")
-    sec: int
-    nanosec: int
-
-
-class Header:
-    __slots__ = ("frame_id", "stamp")
-
-
-class Range:
+class Range(types.SimpleNamespace):
     """Fields of sensor_msgs/Range of ROS 2 Jazzy; no others are accepted."""
 
     NAMES = ("radiation_type", "field_of_view", "min_range", "max_range", "range", "variance")
-    __slots__ = ("header", *NAMES)
 
     def __init__(self, **values):
-        self.header = Header()
-        for name in self.NAMES:
-            setattr(self, name, 0.0)
-        for name, value in values.items():
-            assert name in self.NAMES
-            assert type(value) is float
-            setattr(self, name, value)
+        assert values.keys() <= {*self.NAMES}
+        assert {type(value) for value in values.values()} <= {float}
+        super().__init__(header=types.SimpleNamespace(), **dict.fromkeys(self.NAMES, 0.0) | values)
 
 
 class Time:
@@ -47,9 +32,7 @@ class Time:
         self.nanoseconds = nanoseconds
 
     def to_msg(self):
-        stamp = Stamp()
-        stamp.sec, stamp.nanosec = divmod(self.nanoseconds, 1_000_000_000)
-        return stamp
+        return types.SimpleNamespace(**dict(zip(("sec", "nanosec"), divmod(self.nanoseconds, 10**9), strict=True)))
 
 
 def stand_in(published, values):
@@ -114,5 +97,6 @@ def test_the_node_publishes_corrected_ranges_until_ros_ends(node, monkeypatch):
     assert {topic for topic, _ in messages} == {"uwb/range_1_2"}, "of tag 3 nothing is known"
     assert all(m.range == pytest.approx(2.5, abs=0.3) and m.variance == 0.0625 for _, m in messages)
     assert messages[0][1].header.frame_id == "uwb_1"
+    assert {*vars(messages[0][1]), *vars(messages[0][1].header)} == {"header", "frame_id", "stamp", *Range.NAMES}
     times = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in messages]
     assert [0, *times] == sorted([0, *times])

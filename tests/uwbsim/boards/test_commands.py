@@ -3,7 +3,6 @@
 import math
 import random
 import struct
-import time
 from contextlib import closing
 from itertools import pairwise
 
@@ -12,6 +11,7 @@ import pytest
 
 import uwbsim
 from tests.boards import bench_scenario, served
+from tests.processes import wait_until
 from uwblink.boards.board import Board
 from uwblink.errors import PortLostError, PortMissingError, RefusedError
 from uwblink.importers.poses import read_poses
@@ -279,14 +279,13 @@ def test_served_poses_go_on_after_the_scenario_s_duration(tmp_path):
     short = scenario.model_copy(update={"run": scenario.run.model_copy(update={"duration_s": 1.0})})
     with served(short, speed=20.0) as server:
         server.write_poses(tmp_path / "p.csv")
-        for _ in range(2400):
+
+        def served_s():
             # The file may grow between two readings, so only its complete lines count.
-            complete = (tmp_path / "p.csv").read_text().rpartition("\n")[0].splitlines()[1:]
-            served_s = (int(complete[-1].partition(",")[0]) - server.epoch_ns) * 1e-9
-            if served_s > 5.0:
-                break
-            time.sleep(0.05)
-        assert served_s > 5.0
+            complete = (tmp_path / "p.csv").read_text().rpartition("\n")[0].splitlines()
+            return (int(complete[-1].partition(",")[0]) - server.epoch_ns) * 1e-9 if len(complete) > 1 else 0.0
+
+        wait_until(lambda: served_s() > 5.0)
 
 
 def test_a_step_ends_though_poses_take_longer_to_write_than_they_last(tmp_path):

@@ -136,8 +136,7 @@ def test_protocols_far_apart_are_drawn_about_their_medians_and_whole_half_ticks_
     assert (texts, shown.get_xlabel()) == (
         ["ss, median +280.0 cm", "ds, median +5.1 cm"], "range error less its median (cm)"
     )  # fmt: skip
-    alike = histograms(7.16, {"ss": half * ticks, "ds": half * (ticks + 3)})
-    assert alike.axes[0].get_xlabel() == "range error (cm)"
+    assert histograms(7.16, {"ss": half * ticks, "ds": half * (ticks + 3)}).axes[0].get_xlabel() == "range error (cm)"
 
 
 def judged(flight):

@@ -13,7 +13,7 @@ from docs.site.schema import UNITS, described, reference, unit_of
 from tests import processes
 from tests.errors import one_line
 from tests.shared_data import ROOT
-from uwblink.recording.file import Recording
+from uwblink import load
 from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT
 from uwblink.twr import delay_weights, raw_range
 from uwbsim.boards.server import FaultsFile
@@ -25,24 +25,63 @@ from uwbsim.world.world import World
 SCHEMAS = {model.__name__: model.model_json_schema() for model in (uwbsim.Scenario, FaultsFile, SweepFile)}
 
 
+TWO_STATE = {
+    "model": "two-state",
+    "share": 0.3,
+    "life_s": 0.5,
+    "mean_excess_m": 0.8,
+    "first_path_loss_db": 9.0,
+    "total_loss_db": 2.5,
+}
+ROOM = {"min_m": [-9.0, -9.0, 0.0], "max_m": [9.0, 9.0, 9.0]}
+GEOMETRIC = {"radio.multipath": {"model": "geometric", "scatterers": 3}}
+
+
 @pytest.mark.parametrize(
-    ("override", "fragment"),
+    ("overrides", "fragment"),
     [
-        ("run.duration_s=1e16", r"run\.duration_s: found 1e\+16, at most 1e\+07 is allowed \(time"),
-        ("tags.0.tx_power_db=1e16", r"tags\[0\]\.tx_power_db: found 1e\+16, at most 500"),
-        ("tags.0.lever_arm_m=[1e200, 0, 0]", r"tags\[0\]\.lever_arm_m: found 1e\+200, at most 1e\+06"),
-        ("tags.0.ramp_ppm_per_s=-1e9", r"tags\[0\]\.ramp_ppm_per_s: found -1e\+09, at most 10000 .*crystal"),
-        ("bodies.0.motion.speed_mps=1e16", r"motion\.speed_mps: found 1e\+16, at most 10000 is allowed \("),
-        ("tags.9.skew_ppm=1", "index"),
-        ("tags.x.skew_ppm=1", "index"),
-        ("ranging.rate_hz.deep=1", "rate_hz"),
-        ("=1", "key.path=value"),
-        ("ranging.speed=1", "unknown key"),
+        ({"tags.1.pattern_db": [1.0] * 5}, r"tags\[1\].pattern_db: found 5 coefficients, expected 1, 4, 9, 16, 25"),
+        (
+            {"ranging.reply": {"model": "quantiles", "delays_us": [302.0, 301.0]}},
+            "reply.delays_us: .* must not decrease",
+        ),
+        (
+            {"bodies.0.temperature_c": {"model": "table", "times_s": [0, 0], "values": [1, 2]}},
+            r"bodies\[0\]\.temperature_c.*times_s: .* must increase",
+        ),
+        *(
+            ({"radio.multipath": TWO_STATE | change}, fragment)
+            for change, fragment in (
+                ({"share_std": 0.5}, "share_std: found 0.5, with a mean of 0.3 it is below 0.458"),
+                ({"total_loss_db": 20.0}, "total_loss_db: found 20, at most first_path_loss_db"),
+                ({"pairs": [{"tags": [1, 1]}]}, "tags: found .1, 1., give two tags"),
+                ({"pairs": [{"tags": [1, 2]}, {"tags": [2, 1]}]}, "each pair once"),
+                ({"pairs": [{"tags": [1, 9]}]}, "found tag 9, the tags are 1, 2, 3"),
+                ({"model": "three-state"}, "model"),
+                ({"life_s": 0.0}, "life_s"),
+            )
+        ),
+        (GEOMETRIC, "radio.multipath.scatterers: found 3 but no room"),
+        (
+            GEOMETRIC | {"room": ROOM | {"reflection_loss_db": 6.0}},
+            "room.reflection_loss_db: found 6, but in the geometric model",
+        ),
+        (GEOMETRIC | {"room": ROOM | {"floor": "cheese"}}, "room.floor.*cheese.*known are air"),
+        (["run.duration_s=1e16"], r"run\.duration_s: found 1e\+16, at most 1e\+07 is allowed \(time"),
+        (["tags.0.tx_power_db=1e16"], r"tags\[0\]\.tx_power_db: found 1e\+16, at most 500"),
+        (["tags.0.lever_arm_m=[1e200, 0, 0]"], r"tags\[0\]\.lever_arm_m: found 1e\+200, at most 1e\+06"),
+        (["tags.0.ramp_ppm_per_s=-1e9"], r"tags\[0\]\.ramp_ppm_per_s: found -1e\+09, at most 10000 .*crystal"),
+        (["bodies.0.motion.speed_mps=1e16"], r"motion\.speed_mps: found 1e\+16, at most 10000 is allowed \("),
+        (["tags.9.skew_ppm=1"], "index"),
+        (["tags.x.skew_ppm=1"], "index"),
+        (["ranging.rate_hz.deep=1"], "rate_hz"),
+        (["=1"], "key.path=value"),
+        (["ranging.speed=1"], "unknown key"),
     ],
 )
-def test_values_beyond_limits_and_keys_that_lead_nowhere_are_named(override, fragment):
+def test_values_that_cannot_be_and_keys_that_lead_nowhere_are_named(overrides, fragment):
     with pytest.raises(uwbsim.ScenarioError, match=fragment):
-        uwbsim.load("noiseless", [override])
+        uwbsim.load("noiseless", overrides)
 
 
 @pytest.mark.parametrize("value", [10**400, -2e6, (0.0, 2e6), ((0.0, 1.0), (2e6, 3.0)), (1.0, 10**400)])
@@ -237,24 +276,24 @@ def test_motion_capture_has_gaps_and_latency():
 
 
 def test_show_and_validate(tmp_path):
-    shown = [processes.run("uwbsim", "show", OFFICE, "-o", tmp_path / f"s.{kind}") for kind in ("png", "xyz")]
-    assert [done.returncode for done in shown] == [0, 2]
-    assert "expected .html" in shown[1].stderr
+    processes.succeed("uwbsim", "show", OFFICE, "-o", tmp_path / "s.png")
+    processes.refuse("uwbsim", "show", OFFICE, "-o", tmp_path / "s.xyz", naming=["expected .html"])
     assert (tmp_path / "s.png").stat().st_size > 20_000
-    words = (OFFICE,), (ROOT / "scenarios" / "anchors_and_tag" / "bipartite.toml",), (OFFICE, "--json")
-    told = ("7200 exchanges planned among 6 pairs", "will not be determined", '"air_share"')
-    for own, text in zip(words, told, strict=True):
-        assert text in processes.run("uwbsim", "validate", *own).stdout
+    for words, told in (
+        ((OFFICE,), "7200 exchanges planned among 6 pairs"),
+        (("anchors_and_tag/bipartite",), "will not be determined"),
+        ((OFFICE, "--json"), '"air_share"'),
+    ):
+        assert told in processes.succeed("uwbsim", "validate", *words).stdout
 
 
 def test_listed_success_counts_failures(tmp_path):
     flight = tmp_path / "f.uwb"
     aloha = ROOT / "scenarios" / "collisions" / "aloha.toml"
-    assert processes.run("uwbsim", "run", aloha, "-o", flight, "--set", "run.duration_s=5").returncode == 0
-    shown = json.loads(processes.run("uwblink", "show", flight, "--json").stdout)
-    with Recording.open(flight) as recording:
-        assert sum(p["failed"] for p in shown["pairs"]) == recording.count("faults") > 0
-        assert sum(p["exchanges"] for p in shown["pairs"]) == recording.count("exchanges")
+    processes.succeed("uwbsim", "run", aloha, "-o", flight, "--set", "run.duration_s=5")
+    shown, flown = json.loads(processes.succeed("uwblink", "show", flight, "--json").stdout), load(flight)
+    assert sum(p["failed"] for p in shown["pairs"]) == len(flown.faults) > 0
+    assert sum(p["exchanges"] for p in shown["pairs"]) == len(flown.exchanges)
 
 
 # Scenarios of the package by name: found, listed, copied.
@@ -301,13 +340,9 @@ def test_copies_run_on_their_own(tmp_path):
 
 
 def test_the_command_copies_and_replaces_only_when_told(tmp_path):
-    def run(*words):
-        return processes.run("uwbsim", "scenarios", *words, cwd=tmp_path)
-
-    assert "icra2023/train" in run().stdout
-    assert run("icra2023", "-o", "s").stdout.splitlines() == [
-        f"s/icra2023/{n}.toml" for n in ("test1", "test2", "train")
-    ]
-    again = ("uwbsim", "scenarios", "icra2023", "-o", "s")
-    processes.refuse(*again, cwd=tmp_path, naming=["s/icra2023/test1.toml: already exists", "--force"])
-    assert run("icra2023", "-o", "s", "--force").returncode == 0
+    words = ("uwbsim", "scenarios", "icra2023", "-o", "s")
+    assert "icra2023/train" in processes.succeed("uwbsim", "scenarios").stdout
+    copied = processes.succeed(*words, cwd=tmp_path).stdout.splitlines()
+    assert copied == [f"s/icra2023/{name}.toml" for name in ("test1", "test2", "train")]
+    processes.refuse(*words, cwd=tmp_path, naming=["s/icra2023/test1.toml: already exists", "--force"])
+    processes.succeed(*words, "--force", cwd=tmp_path)

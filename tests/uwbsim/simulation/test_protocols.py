@@ -95,11 +95,10 @@ def test_same_seed_same_columns_and_another_seed_others():
 def ring(count=6, **ranging):
     angle = 2 * np.pi * np.arange(count) / count
     places = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), np.ones(count)]).tolist()
-    pairs = [(k, (k + 1) % count) for k in range(count)]
     return Scenario.model_validate(
         {
             "run": {"seed": 5, "duration_s": 20.0},
-            "ranging": {"rate_hz": 60.0, "pairs": pairs, **ranging},
+            "ranging": {"rate_hz": 60.0, "pairs": [(k, (k + 1) % count) for k in range(count)], **ranging},
             "bodies": [{"name": str(k), "motion": {"model": "static", "position_m": p}} for k, p in enumerate(places)],
             "tags": [{"id": k, "body": str(k)} for k in range(count)],
         }

@@ -7,14 +7,13 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import duckdb
 import pytest
 
 from tests.errors import one_line
-from tests.processes import CONTEXT, refuse, succeed
+from tests.processes import CONTEXT, refuse, succeed, wait_until
 from tests.uwbsim.sweep.test_sweep import GRID, HEAD, plan, rows
 from uwblink.errors import UwblinkError
 from uwbsim.sweep.executors import ClusterLostError
@@ -199,14 +198,6 @@ def test_a_sweep_that_ends_early_leaves_no_worker_and_goes_on_where_it_was(tmp_p
     assert 0 < before < p.total
     assert run_sweep(p, out, workers=1, resume=True) == SweepSummary(p.total - before, 0, before)
     assert [int(row["number"]) for row in rows(out)] == [k for k in range(p.total) for _ in range(2)], "nothing twice"
-
-
-def wait_until(ready):
-    for _ in range(1200):
-        if ready():
-            return
-        time.sleep(0.05)
-    raise AssertionError("nothing happened for a minute")
 
 
 def test_a_worker_that_dies_as_it_begins_is_one_line(tmp_path):

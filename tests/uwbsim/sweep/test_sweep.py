@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 from tests.errors import one_line
-from uwblink.protocols.table import PROTOCOLS, register_protocol
+from tests.registered import registered
+from uwblink.protocols.table import PROTOCOLS
 from uwbsim import ParameterError, ScenarioError, UwbsimError, load_design, run_sweep
 from uwbsim.sweep.executors import Cluster, Processes
-from uwbsim.world.channel import CHANNEL_EFFECTS, register_channel_effect
+from uwbsim.world.channel import CHANNEL_EFFECTS, ChannelEffect
 
 HEAD = '[sweep]\nscenario = "icra2023/test1"\nprotocols = ["ss-cfo", "ds"]\n'
 GRID = '[vary]\n"ranging.response_delay_uus" = [300, 1500]\n"radio.rx_noise_ps" = [0.0, 50.0, 100.0]\n'
@@ -203,18 +204,12 @@ def stranger(tmp_path, monkeypatch):
 def test_functions_of_a_stranger_reach_other_processes(tmp_path, stranger):
     """An evaluation, a protocol and an effect of the channel, with the same results as in this process."""
     own = {"flight_ticks": stranger.flight_ticks, "delay_weights": stranger.delay_weights}
-    register_protocol(replace(PROTOCOLS["ss"], name="mine", **own))
-    try:
+    with registered(PROTOCOLS, replace(PROTOCOLS["ss"], name="mine", **own)):
         p = plan(tmp_path, CALIBRATE.replace('["ds"]', '["ss", "mine"]'))
         run_sweep(p, tmp_path / "without", workers=1, evaluate=stranger.figures)
-        register_channel_effect("weaker", stranger.weaker)
-        try:
+        with registered(CHANNEL_EFFECTS, ChannelEffect("weaker", stranger.weaker)):
             for workers in (1, 2):
                 run_sweep(p, tmp_path / str(workers), workers=workers, evaluate=stranger.figures)
-        finally:
-            CHANNEL_EFFECTS.remove("weaker")
-    finally:
-        PROTOCOLS.remove("mine")
     assert (tmp_path / "1" / "results.csv").read_bytes() == (tmp_path / "2" / "results.csv").read_bytes()
     counts = {
         name: [int(row["count"]) for row in rows(tmp_path / "2") if row["protocol"] == name] for name in ("ss", "mine")

@@ -10,7 +10,7 @@ import uwbsim
 from calib import Calibration
 from tests import processes
 from tests.uwbsim.twins.worlds import box, known, world
-from uwblink import PROTOCOLS, Exchanges, Poses, Tag, UwblinkError, load
+from uwblink import PROTOCOLS, Exchanges, Poses, Tag, UwblinkError
 from uwbsim.cli.commands import _print_table
 from uwbsim.pages import TWIN_COLUMNS
 from uwbsim.scenario.radio import Radio
@@ -160,13 +160,6 @@ def test_recordings_without_a_twin(flight, what):
         uwbsim.twin(change(flight), known(world()))
 
 
-def test_insufficient_recordings_have_status_1(tmp_path):
-    uwbsim.simulate(uwbsim.load("noiseless", {"run.duration_s": 0.2})).save(tmp_path / "short.uwb")
-    (tmp_path / "c.json").write_text(json.dumps(known(world())))
-    words = ("uwbsim", "twin", "short.uwb", "-c", "c.json", "-o", "twin.toml")
-    processes.refuse(*words, cwd=tmp_path, status=1, naming=["exchanges, but a twin needs 100 or more"])
-
-
 CURVE = known(world())["bias_curve"]
 
 
@@ -204,16 +197,6 @@ def test_the_scenario_has_the_curve_of_the_calibration_at_any_level_of_lifting(f
 def test_calibrations_without_a_twin_are_refused_by_place(flight, change, place):
     with pytest.raises(uwbsim.ScenarioError, match=f"^calibration: .*{place}"):
         uwbsim.twin(flight, known(world()) | change)
-
-
-def test_twins_with_errors_write_no_files(flight, tmp_path):
-    flight.save(tmp_path / "f.uwb")
-    (tmp_path / "c.json").write_text("{}")
-    (tmp_path / "t.html").write_text("mine")
-    for output, message in (("t.toml", "already exists"), ("u.txt", "found .txt"), ("u.toml", "no schema_version")):
-        processes.refuse("uwbsim", "twin", "f.uwb", "-c", "c.json", "-o", output, cwd=tmp_path, naming=[message])
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["c.json", "f.uwb", "t.html"]
-    assert len(load(tmp_path / "f.uwb").poses) > 0
 
 
 def test_a_terminal_of_80_columns_loses_no_figure(compared, capsys, monkeypatch):
@@ -299,8 +282,7 @@ def test_shares_are_found_of_all_and_of_pairs(made, reflected_found):
     """The shares of the flight itself; with 60 to 170 spells per pair, they are 3 points from the requested ones."""
     whole, state, asked = made
     assert reflected_found.share == pytest.approx(np.mean(state), abs=0.02)
-    own = [np.mean(state[whole.pair == k]) for k in range(6)]
-    assert reflected_found.pair_share == pytest.approx(own, abs=0.03)
+    assert reflected_found.pair_share == pytest.approx([np.mean(state[whole.pair == k]) for k in range(6)], abs=0.03)
     assert np.corrcoef(reflected_found.pair_share, asked)[0, 1] > 0.95
     assert np.std(reflected_found.pair_share) > 0.04
     assert reflected_found.mean_excess_m == pytest.approx(0.4, rel=0.1)

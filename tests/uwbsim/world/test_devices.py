@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 import uwbsim
+from tests.registered import registered
 from tests.uwbsim.world.helpers import served
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT, Board, Recording, raw_range
 from uwblink.ticks import METRES_PER_TICK
 from uwbsim.protocols.conditions import conditions_of, range_errors_m
 from uwbsim.protocols.prediction import predict
-from uwbsim.world.channel import CHANNEL_EFFECTS
+from uwbsim.world.channel import CHANNEL_EFFECTS, ChannelEffect
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.reception import AntennaDelays
 
@@ -120,11 +121,6 @@ def test_a_profile_from_a_file_and_what_the_recording_tells(tmp_path, monkeypatc
     # 200 readings determine a deviation to 5 %.
     assert np.std(noisy["temperature_c"]) == pytest.approx(0.1, rel=0.15)
     assert uwbsim.simulate(scenario()).temperature == {}
-
-
-def test_a_hole_in_a_profile_is_one_line(tmp_path):
-    with pytest.raises(uwbsim.ScenarioError, match=r"bodies\[0\]\.temperature_c.*times_s: .* must increase"):
-        scenario(bodies=({"temperature_c": {"model": "table", "times_s": [0, 0], "values": [1, 2]}}, {}))
 
 
 WAVES = {"model": "harmonics", "mean_cm": 1.0, "cosine_cm": [2.0, 0.5], "sine_cm": [0.0, 3.0], "elevation_cm": 4.0}
@@ -239,19 +235,13 @@ def weaken_tag(link, ends):
 @pytest.fixture(scope="module")
 def both():
     """The same world without and with the effect: a flight, served boards, and conditions of comparisons."""
-    found = []
-    for _ in range(2):
-        found.append(
-            (
-                uwbsim.simulate(reception()),
-                served(reception()),
-                conditions_of(reception()),
-            )
-        )
-        if not found[1:]:
-            uwbsim.register_channel_effect("weaken", weaken_tag)
-    CHANNEL_EFFECTS.remove("weaken")
-    return found
+
+    def received():
+        return uwbsim.simulate(reception()), served(reception()), conditions_of(reception())
+
+    before = received()
+    with registered(CHANNEL_EFFECTS, ChannelEffect("weaken", weaken_tag)):
+        return before, received()
 
 
 def test_a_plug_ins_effect_shows_in_flights_draw_for_draw(both):
@@ -348,9 +338,6 @@ def test_wrong_effects_are_refused(name, effect, fragment):
     ],
 )
 def test_an_effect_that_returns_no_links_is_named(effect, fragment):
-    uwbsim.register_channel_effect("strange", effect)
-    try:
-        with pytest.raises(uwbsim.UwbsimError, match=f"channel effect 'strange'.*{fragment}"):
-            uwbsim.simulate(reception())
-    finally:
-        CHANNEL_EFFECTS.remove("strange")
+    said = pytest.raises(uwbsim.UwbsimError, match=f"channel effect 'strange'.*{fragment}")
+    with registered(CHANNEL_EFFECTS, ChannelEffect("strange", effect)), said:
+        uwbsim.simulate(reception())
