@@ -19,7 +19,6 @@ from calib.report import Heading, Picture, Table, Text, check_places
 from calib.report.figures import arrangement
 from calib.report.sections import SECTIONS
 from tests import pages, processes
-from tests.calib.report.test_report import fonts_of
 from uwblink import Contents, Recording, UwblinkError
 from uwblink.pages import figures
 from uwblink.pages.blocks import Document, write_document
@@ -145,6 +144,16 @@ def weather(campaign):
     return [Heading("Weather"), Text(f"Dry over {len(campaign.judged)} ranges; <wet> tomorrow.")]
 
 
+def fonts_of(resources):
+    """Yield the kind of every font in some resources, forms included."""
+    for font in (resources.get("/Font") or {}).values():
+        for one in [font.get_object(), *(d.get_object() for d in font.get_object().get("/DescendantFonts", []))]:
+            yield one["/Subtype"]
+    for form in (one.get_object() for one in (resources.get("/XObject") or {}).values()):
+        if form["/Subtype"] == "/Form" and "/Resources" in form:
+            yield from fonts_of(form["/Resources"].get_object())
+
+
 def test_registered_sections_are_in_the_report(campaign, tmp_path, sections):
     sections |= {"delays": SECTIONS["delays"]}
     calib.register_report_section("weather", weather, before="determined")
@@ -157,11 +166,21 @@ def test_registered_sections_are_in_the_report(campaign, tmp_path, sections):
     outline: list[Any] = printed.outline
     begin = {item["/Title"]: printed.get_destination_page_number(item) for item in outline}
     assert list(begin) == titles
-    texts = [one.extract_text() for one in printed.pages]
+    sizes: set[float] = set()
+
+    def seen(text, cm, tm, font, size):
+        if text.strip():
+            sizes.add(size * abs(tm[3] or tm[1]) * abs(cm[3] or cm[1]))
+
+    texts = [one.extract_text(visitor_text=seen) for one in printed.pages]
+    assert min(sizes) >= 7.99, "no text is smaller than 8 pt"
     assert all(name in texts[place] for name, place in begin.items())
     assert all(f"{number} / {len(texts)}" in text for number, text in enumerate(texts, 1))
     assert any("antenna delay (ns)" in text for text in texts), "the words inside a figure are words"
-    kinds = {kind for one in printed.pages for kind in fonts_of(one["/Resources"], set())}
+    numbered = re.findall(r"Figure (\d+)\.", "\n".join(texts))
+    assert [int(number) for number in numbered] == list(range(1, len(numbered) + 1))
+    # Outlines that printers accept: type 42; publishers refuse type 3.
+    kinds = {kind for one in printed.pages for kind in fonts_of(one["/Resources"])}
     assert kinds <= {"/Type0", "/CIDFontType2", "/TrueType"}
 
 
