@@ -129,13 +129,6 @@ def test_antenna_delays_are_not_invented(folder):
         assert "antenna_delay" not in processes.succeed("uwblink", "show", folder / name).stdout
 
 
-def test_an_anchor_with_itself_is_named(folder):
-    contents = uwblink.load(folder / "fly/d.uwb")
-    same = {**contents.differences, "plus": contents.differences["minus"]}
-    replace(contents, differences=same).save(folder / "same.uwb", force=True)
-    processes.refuse("calib", "fit", "same.uwb", "-o", "x.json", *FIT, cwd=folder, naming=["same.uwb", "at both ends"])
-
-
 def test_undetermined_differences_are_not_corrected(folder):
     ranges = calib.Ranges.from_arrays([3.0] * 5, initiator=1, target=2)
     with pytest.raises(calib.CalibError, match="only differences of arrival"):
@@ -255,15 +248,19 @@ def test_options_that_exclude_differences_are_refused(folder, words, naming, sta
 
 
 @pytest.mark.parametrize(
-    "words", [("fit", "-o", "x.json", *FIT), ("localize", "-c", "fit.json", "--use", "receptions")]
+    ("words", "plus", "naming"),
+    [
+        (("fit", "-o", "x.json", *FIT), 77, ["anchor 77", "no position"]),
+        (("localize", "-c", "fit.json", "--use", "receptions"), 77, ["anchor 77", "no position"]),
+        (("fit", "-o", "x.json", *FIT), None, ["at both ends"]),
+    ],
 )
-def test_an_anchor_without_a_place_is_named(folder, words):
+def test_an_anchor_without_a_place_or_with_itself_is_named(folder, words, plus, naming):
     contents = uwblink.load(folder / "fly/d.uwb")
-    lost = contents.differences["plus"].copy()
-    lost[7] = 77
-    replace(contents, differences={**contents.differences, "plus": lost}).save(folder / "lost.uwb", force=True)
-    naming = ["lost.uwb", "anchor 77", "no position"]
-    processes.refuse("calib", words[0], "lost.uwb", *words[1:], cwd=folder, naming=naming, status=2)
+    wrong = {name: column.copy() for name, column in contents.differences.items()}
+    wrong["plus"][7] = wrong["minus"][7] if plus is None else plus
+    replace(contents, differences=wrong).save(folder / "wrong.uwb", force=True)
+    processes.refuse("calib", words[0], "wrong.uwb", *words[1:], cwd=folder, naming=["wrong.uwb", *naming], status=2)
 
 
 @pytest.mark.slow

@@ -46,7 +46,7 @@ def spans(count):
 
 def moved(by_m):
     """Return a world in which board 4 is moved during the third arrangement."""
-    world = standing_boards(6, places=FOUR[:3], pair_error_m=0.01)
+    world = standing_boards(6, places=FOUR[:3], pair_error_m=0.01, bias_size_m=0.02)
     r, place = world.ranges, world.places[2][:, 0]
     late = (r.time_ns > 2 * 70e9 + 25e9) & (r.time_ns < 3 * 70e9 - 5e9) & ((r.initiator == 4) | (r.target == 4))
     away = place[3] - place[r.initiator + r.target - 5]
@@ -56,7 +56,7 @@ def moved(by_m):
 def crooked():
     places = [p.copy() for p in FOUR[:5]]
     places[2][3, 1] = 0.8
-    return standing_boards(2, places=places, pair_error_m=0.01)
+    return standing_boards(2, places=places, pair_error_m=0.01, bias_size_m=0.02)
 
 
 def saved(world, path, known="line", distances=(), power_dbm=None):
@@ -279,6 +279,7 @@ def test_a_board_that_was_moved_is_named(by_m, chance):
     assert 0 < found.p_value < chance
 
 
+STRAIGHT = standing_boards(9, places=FOUR[:5], pair_error_m=0.01, bias_size_m=0.02)
 TAPES = KnownDistance(1, 3, 2.1 + 0.3, 0.005, "A"), KnownDistance(2, 4, 2.7, 0.005, "A")
 """A measured distance that is 30 cm off, and one that is right."""
 
@@ -287,8 +288,8 @@ TAPES = KnownDistance(1, 3, 2.1 + 0.3, 0.005, "A"), KnownDistance(2, 4, 2.7, 0.0
 @pytest.mark.parametrize(
     ("world", "tapes", "expected"),
     [
-        (standing_boards(9, places=FOUR[:5], pair_error_m=0.01), (), []),
-        (standing_boards(9, places=FOUR[:5], pair_error_m=0.01), TAPES, [
+        (STRAIGHT, (), []),
+        (STRAIGHT, TAPES, [
             ("wrong known distance", r"the known distance of 1 and 3 in A differs from the ranges by \+\d+ cm"),
         ]),
         (crooked(), (), [("arrangement not as stated", "C: the boards are not on a line")]),
