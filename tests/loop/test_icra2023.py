@@ -10,6 +10,7 @@ from benchmarks.accuracy import LOSSES, one
 from calib import Calibration, load_calibration, load_ranges
 from calib.data.ranges import concatenate
 from tests import processes
+from tests.calib import synthetic
 from tests.shared_data import ROOT, shared
 from uwblink import SPEED_OF_LIGHT, Recording
 
@@ -103,7 +104,7 @@ def test_powers_and_errors_by_power_are_those_of_the_papers_samples(flights):
     r = load_ranges(flights / "train.uwb")
     delay = np.array([r.planted["delays_ns"].get(str(tag), 0.0) for tag in range(7)]) * 1e-9
     weighted = r.weight_initiator * delay[r.initiator] + r.weight_target * delay[r.target]
-    error, mine = r.raw_m + SPEED_OF_LIGHT * weighted - r.truth_m, lift(r)
+    error, mine = r.raw_m + SPEED_OF_LIGHT * weighted - r.truth_m, synthetic.lifted(r.fpp1_dbm, r.fpp2_dbm)
     # Flights differ in rooms and durations: 2 % of lifted power in the bulk, 5 % at the ends.
     np.testing.assert_allclose(np.quantile(mine, [0.05, 0.5, 0.95]), np.quantile(lifted, [0.05, 0.5, 0.95]), atol=0.06)
     assert mine.max() < 1.6
@@ -114,10 +115,6 @@ def test_powers_and_errors_by_power_are_those_of_the_papers_samples(flights):
         ours = clipped(error[(mine >= low) & (mine < high)])
         assert np.std(ours) == pytest.approx(np.std(theirs), abs=0.012), (low, high)
         assert np.mean(ours) == pytest.approx(np.mean(theirs), abs=0.012), (low, high)
-
-
-def lift(r):
-    return (10 ** ((r.fpp1_dbm + 82) / 10) + 10 ** ((r.fpp2_dbm + 82) / 10)) / 2
 
 
 def clipped(error):

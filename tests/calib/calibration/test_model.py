@@ -300,6 +300,7 @@ def test_error_models_are_read_unchanged_and_may_be_missing(error_fitted):
         ("pairs", {"1-2": {"noise": 1.0, "odds": 0.0, "detour": 1.0}}, "1-2: odds"),
         ("levels", [[0.1]], "levels"),
         ("scale", "wide", "scale"),
+        ("long_share", 1.5, "long_share"),
     ],
 )
 def test_a_damaged_model_is_one_clear_error(error_fitted, key, value, said):

@@ -66,7 +66,11 @@ def test_intervals_of_few_ranges_cover_the_truth():
     scores = []
     for seed in range(12):
         some = synthetic.ranges(n=100, noise_m=0.05, tail=0, seed=seed)
-        flat = replace(some, raw_m=some.raw_m - synthetic.bias_m(lifted(some)), time_ns=20 * some.time_ns)
+        flat = replace(
+            some,
+            raw_m=some.raw_m - synthetic.bias_m(synthetic.lifted(some.fpp1_dbm, some.fpp2_dbm)),
+            time_ns=20 * some.time_ns,
+        )
         known = calib.fit(flat, loss="l2").calibration
         scores.append(np.divide(*synthetic.about_their_mean(known, synthetic.DELAYS_NS)))
     # Twelve fits with three differences of delays each determine a standard deviation to 12 %. Testing for persistence
@@ -82,10 +86,6 @@ def test_times_in_microseconds_for_nanoseconds_do_not_narrow_intervals():
     widths = [np.mean(list(found.calibration.delays_std_ns.values())) for found in (sound, hasty)]
     assert widths[1] > 0.75 * widths[0]
     assert [said for said in hasty.warnings if "s of data" in said]
-
-
-def lifted(ranges):
-    return np.mean([10 ** ((power + 82) / 10) for power in (ranges.fpp1_dbm, ranges.fpp2_dbm)], axis=0)
 
 
 def blocks(count, seconds):

@@ -10,7 +10,7 @@ from calib import Calibration, UnanswerableError, fit
 from calib.calibration.power_curves import basis, curvature, lifted_power
 from calib.data.ranges import without_static
 from calib.estimator import known_distances
-from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
+from tests.calib.synthetic import DELAYS_NS, about_their_mean, bias_m, ranges
 
 
 @pytest.mark.slow
@@ -22,11 +22,9 @@ def test_the_joint_fit_is_better_if_power_depends_on_the_pair():
     fpp = [np.where(low, power - 6, power) for power in (r.fpp1_dbm, r.fpp2_dbm)]
     before, after = (lifted_power(one, two, "mean-of-lifted", -82.0) for one, two in ((r.fpp1_dbm, r.fpp2_dbm), fpp))
     r = replace(r, fpp1_dbm=fpp[0], fpp2_dbm=fpp[1], raw_m=r.raw_m + slope * (after - before))
-    wrong = {}
-    for sequential in (False, True):
-        c = fit(r, sequential=sequential).calibration
-        wrong[sequential] = np.std(np.array([c.delays_ns[tag] - d for tag, d in DELAYS_NS.items()]))
-    assert wrong[False] < 0.02 < wrong[True]
+    fits = (fit(r, sequential=sequential).calibration for sequential in (False, True))
+    together, after = (np.std(about_their_mean(found, DELAYS_NS)[0]) for found in fits)
+    assert together < 0.02 < after
 
 
 def grouped(r, groups):

@@ -44,9 +44,9 @@ def spans(count):
     return {str(k + 1): (70.0 * k, 70.0 * k + 60) for k in range(count)}
 
 
-def moved(by_m):
+def moved(by_m, arrangements, **settings):
     """Return a world in which board 4 is moved during the third arrangement."""
-    world = standing_boards(6, places=FOUR[:3], pair_error_m=0.01, bias_size_m=0.02)
+    world = standing_boards(9, places=FOUR[:arrangements], pair_error_m=0.01, **settings)
     r, place = world.ranges, world.places[2][:, 0]
     late = (r.time_ns > 2 * 70e9 + 25e9) & (r.time_ns < 3 * 70e9 - 5e9) & ((r.initiator == 4) | (r.target == 4))
     away = place[3] - place[r.initiator + r.target - 5]
@@ -55,8 +55,8 @@ def moved(by_m):
 
 def crooked():
     places = [p.copy() for p in FOUR[:5]]
-    places[2][3, 1] = 0.8
-    return standing_boards(2, places=places, pair_error_m=0.01, bias_size_m=0.02)
+    places[2][3, 1] = 1.2
+    return standing_boards(9, places=places, pair_error_m=0.01, bias_size_m=0.02)
 
 
 def saved(world, path, known="line", distances=(), power_dbm=None):
@@ -269,7 +269,7 @@ def test_known_positions_give_the_frame_and_mirror_images_are_stated():
 
 @pytest.mark.parametrize(("by_m", "chance"), [(0.10, 1e-6), (-0.25, 1e-50)])
 def test_a_board_that_was_moved_is_named(by_m, chance):
-    ranges, known = moved(by_m).ranges, calib.Knowledge(shape="line", spans_s=spans(3))
+    ranges, known = moved(by_m, 3).ranges, calib.Knowledge(shape="line", spans_s=spans(3))
     with pytest.raises(calib.UnanswerableError, match=r"^3: board 4 was moved 2\d s after the start"):
         calib.survey(ranges, known=known)
     (found,) = calib.survey(ranges, known=known, regardless=True).contradictions
@@ -293,7 +293,7 @@ TAPES = KnownDistance(1, 3, 2.1 + 0.3, 0.005, "A"), KnownDistance(2, 4, 2.7, 0.0
             ("wrong known distance", r"the known distance of 1 and 3 in A differs from the ranges by \+\d+ cm"),
         ]),
         (crooked(), (), [("arrangement not as stated", "C: the boards are not on a line")]),
-        (moved(0.1), (), [("board moved within an arrangement", r"C: board 4 was moved 2\d s")]),
+        (moved(0.2, 5, bias_size_m=0.02), (), [("board moved within an arrangement", r"C: board 4 was moved 2\d s")]),
     ],
     ids=["sound", "a wrong tape", "crooked", "moved"],
 )  # fmt: skip
