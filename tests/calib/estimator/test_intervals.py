@@ -22,9 +22,10 @@ def fitted(recipe, seed=12_003, **settings):
     return fit_known_distances(make(recipe, seed).ranges, calib.FitSettings(**settings))
 
 
-def test_variances_account_for_fitted_unknowns():
+def test_least_squares_of_delays_alone_and_its_variances_agree_with_numpy():
     model = model_of(make(CLEAN["short, 30 s"], 12_004).ranges[:400], calib.FitSettings(delays_only=True))
-    found = robust_fit(model, model.ranges.raw_m - model.ranges.truth_m, "l2", None, ("delay",))
+    error = model.ranges.raw_m - model.ranges.truth_m
+    found = robust_fit(model, error, "l2", None, ("delay",))
     delays = found.optimum.layout.indices(["delay"])
     cut = time_blocks(model.ranges.time_ns, model.ranges.session)
     kept = {"delay": Kept.delays(delays, 1e9, model.held)}
@@ -34,6 +35,7 @@ def test_variances_account_for_fitted_unknowns():
     tags, ranges = np.array(model.tags), model.ranges
     weights = ((ranges.initiator, ranges.weight_initiator), (ranges.target, ranges.weight_target))
     matrix = sum((ids[:, None] == tags) * weight[:, None] for ids, weight in weights) * 0.299702547
+    np.testing.assert_allclose(found.optimum.of("delay"), -np.linalg.lstsq(matrix, error)[0], atol=2e-6)
     scores = matrix * found.residuals[:, None]
     sums = np.array([scores[cut.number == k].sum(axis=0) for k in range(cut.count)])
     inverse = np.linalg.inv(matrix.T @ matrix)
