@@ -136,23 +136,6 @@ def test_a_robot_that_never_sends_is_localized(known, heard):
 
 
 @pytest.mark.slow
-def test_the_filter_includes_common_errors_of_listeners(heard):
-    (problem,), rng = problems(load_flight(heard)), np.random.default_rng(5)
-    true_m = problem.ranges.arrivals.truth_m[problem.rows - len(problem.ranges)]
-    drawn = 0.3 * rng.normal(size=len(problem.ranges))[problem.exchange] + 0.05 * rng.normal(size=len(true_m))
-    own, common = np.full(len(true_m), 0.05), np.full(len(true_m), 0.3)
-    means = list[float]()
-    for std, shared in ((own, common), (np.hypot(own, common), 0 * common)):
-        measured = {"variance": FilterRanges(true_m + drawn, std, shared, np.zeros_like(problem.sign))}
-        tracks = run_filters(problem, measured, replace(LISTEN, gate=1e9))["variance"]
-        means.append(float(np.mean([track.nees for track in tracks])))
-    # If they were taken for independent, two listeners would count as two exchanges, and the filter would be
-    # overconfident.
-    assert 2.5 < means[0] < 3.5
-    assert means[1] > 1.3 * means[0]
-
-
-@pytest.mark.slow
 def test_constants_of_both_pairs_in_a_difference_are_followed(heard):
     (problem,), rng = problems(load_flight(heard)), np.random.default_rng(6)
     true_m, zero = problem.ranges.arrivals.truth_m[problem.rows - len(problem.ranges)], np.zeros(len(problem))
