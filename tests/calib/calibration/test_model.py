@@ -399,9 +399,8 @@ def test_undetermined_pairs_are_named_and_other_pairs_corrected(tmp_path):
     assert "left out" not in whole.stderr
     assert [line for line in part.stderr.splitlines() if all(pair in line for pair in named)]
     assert f"{np.count_nonzero(~across)} ranges are left out" in part.stderr
-    for name in ("two.uwb", "one.uwb"):
-        assert rows(tmp_path / name, "corrected") == rows(tmp_path / "one.uwb", "corrected")
-        assert rows(tmp_path / name, "exchanges") == rows(tmp_path / "one.uwb", "exchanges")
+    for table in ("corrected", "exchanges"):
+        assert rows(tmp_path / "two.uwb", table) == rows(tmp_path / "one.uwb", table)
     # Evaluation and localization also leave these pairs out.
     for command in (("evaluate",), ("localize", "--seeds", 1)):
         said = [succeed("calib", *command, name, "-c", "c.json", cwd=tmp_path) for name in ("across.uwb", "all.uwb")]

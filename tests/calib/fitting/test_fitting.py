@@ -217,7 +217,7 @@ def test_the_delay_of_a_new_tag_is_found_and_others_stay(known):
 @pytest.mark.parametrize(
     ("tag", "loss", "changes", "error", "said"),
     [
-        (-1, "l2", {}, calib.BadInputError, "`tag`"),
+        (-1, "l2", {}, calib.BadInputError, "`tag`: found -1"),
         (7, "arctan", {}, calib.BadInputError, "`loss`"),
         (1, "l2", {}, calib.BadInputError, "`tag`"),
         (42, "l2", {}, calib.BadInputError, "has no ranges"),
