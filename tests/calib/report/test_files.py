@@ -174,6 +174,14 @@ def test_registered_sections_are_in_the_report(campaign, tmp_path, sections):
     assert kinds <= {"/Type0", "/CIDFontType2", "/TrueType"}
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("sections")
+def test_the_command_writes_a_pdf(folder, tmp_path):
+    words = ("calib", "report", folder / "a.uwb", "--loss", "huber", "-o", tmp_path / "r.html")
+    succeed(*words, "--pdf", tmp_path / "r.pdf")
+    assert "Provenance" in "".join(page.extract_text() for page in PdfReader(tmp_path / "r.pdf").pages)
+
+
 @pytest.mark.parametrize(
     ("name", "section", "before", "parameter"),
     [
