@@ -155,7 +155,8 @@ def curve_over_power(
     axes.plot(everything.lifted, values["all"], "o", color=INK, ms=3, label=text, zorder=4)
     curve = calibration.bias_curve if bias else calibration.sigma_curve
     grid = np.linspace(*curve.range, 300)
-    limit_without_outliers(axes, np.concatenate([*values.values(), 100 * curve(grid)]))
+    # Most of a curve over lifted power can be flat, and most ranges in its steep part.
+    limit_without_outliers(axes, np.concatenate([*values.values(), 100 * curve(grid)]), 100 * curve(everything.lifted))
     if bias and not squares:
         medians = 100 * everything.median_m
         axes.plot(everything.lifted, medians, "_", color=MUTED, ms=6, label="medians, reflections included")
@@ -257,9 +258,9 @@ def within_fence(values: Floats) -> Any:
     return away <= (12.0 * usual if usual > 0 else np.inf)
 
 
-def limit_without_outliers(axes: Axes, values: Floats) -> None:
-    """Set the limits of the vertical axis to values (n,) without outliers."""
-    inside = values[within_fence(values)]
+def limit_without_outliers(axes: Axes, values: Floats, shown: Floats | tuple[()] = ()) -> None:
+    """Set the limits of the vertical axis to values (n,) without outliers, and to the values `shown` (k,)."""
+    inside = np.append(values[within_fence(values)], shown)
     margin = 0.12 * float(np.ptp(inside)) + 1e-9
     axes.set_ylim(inside.min() - margin, inside.max() + margin)
 

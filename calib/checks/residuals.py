@@ -293,7 +293,8 @@ def changes_of_tags(fit: QuickFit, courses: Floats) -> Iterator[Change]:
     """
     named, found = set[int | None]({None}), _changes(fit, courses)
     # Two courses that share less than half of their variance are different changes.
-    same = np.atleast_2d(np.corrcoef(courses.T)) ** 2 > 0.5
+    with np.errstate(invalid="ignore"):  # a constant course is like no other
+        same = np.atleast_2d(np.corrcoef(courses.T)) ** 2 > 0.5
     for one in found:
         against = [
             two

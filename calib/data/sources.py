@@ -36,7 +36,7 @@ from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
 from uwblink.recording.summary import single_reports
-from uwblink.twr import Exchanges
+from uwblink.twr import Exchanges, without_stamps
 
 
 @runtime_checkable
@@ -337,9 +337,15 @@ def ranges_of(source: Source, name: str, *, truth: bool = True) -> tuple[Exchang
     """Return the exchanges of a source, and a range for each, with all that the source knows of it.
 
     If both ends reported an exchange, one report is used. With `truth` False, true distances and poses are not used:
-    distances and directions are NaN. Raises `BadInputError` if planted values or antenna delays have a wrong form.
+    distances and directions are NaN. Raises `BadInputError` if planted values or antenna delays have a wrong form, and
+    if ranges are corrected already: those without stamps hold what `calib apply` wrote.
     """
     exchanges, warm = single_reports(source.exchanges).exchanges, getattr(source, "temperature", None)
+    meta = getattr(source, "meta", None) or {}
+    if "calibration" in meta and without_stamps(exchanges).any():
+        raise BadInputError(
+            f"{name}: its ranges without stamps are already corrected; use the recording from which they were made"
+        )
     found = Ranges.from_exchanges(
         exchanges,
         None if truth else np.full(len(exchanges), np.nan),
@@ -347,7 +353,7 @@ def ranges_of(source: Source, name: str, *, truth: bool = True) -> tuple[Exchang
         tags=source.tags,
         planted=planted_of(source, name),
         source=name,
-        antenna_delays=antenna_delays_in(getattr(source, "meta", None) or {}, name),
+        antenna_delays=antenna_delays_in(meta, name),
         temperature=warm,
     )
     celsius = found.temperature_c[np.isfinite(found.temperature_c)]

@@ -16,14 +16,18 @@ def bias_m(lifted):
     return 0.08 * np.sin(4 * lifted) - 0.03
 
 
+def lifted(fpp1_dbm, fpp2_dbm):
+    """Return the mean lifted powers of both ends."""
+    return (10 ** ((fpp1_dbm + 82) / 10) + 10 ** ((fpp2_dbm + 82) / 10)) / 2
+
+
 def ranges(n=6000, noise_m=0.05, tail=0.1, seed=1, k=1.00001, bias=bias_m):
     rng = np.random.default_rng(seed)
     initiator, target = np.array(PAIRS)[np.arange(n) % len(PAIRS)].T
     fpp = rng.uniform(-95, -80, (2, n))
-    lifted = np.mean(10 ** ((fpp + 82) / 10), axis=0)
     truth = rng.uniform(1, 6, n)
     delay = np.array([DELAYS_NS.get(t, np.nan) for t in range(8)])
-    raw = truth + bias(lifted) - 0.5e-9 * SPEED_OF_LIGHT * (delay[initiator] + k * delay[target])
+    raw = truth + bias(lifted(*fpp)) - 0.5e-9 * SPEED_OF_LIGHT * (delay[initiator] + k * delay[target])
     raw = raw + rng.normal(0, 1, n) * noise_m + np.where(rng.random(n) < tail, rng.exponential(0.4, n), 0)
     return Ranges(
         source="synthetic",

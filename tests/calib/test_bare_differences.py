@@ -87,6 +87,11 @@ def folder(tmp_path_factory):
     return found
 
 
+@pytest.fixture(scope="module")
+def fly(folder):
+    return uwblink.load(folder / "fly/d.uwb")
+
+
 def test_differences_determine_delays_minus_their_mean(folder):
     known = calib.load_calibration(folder / "fit.json")
     found = np.array([known.delays_ns[tag] for tag in range(1, 9)])
@@ -123,17 +128,10 @@ def test_differences_are_shown_and_not_streamed(folder):
     assert re.search(r"(?s)alone.*9600 differences of arrival and no exchanges.*calib fit --use receptions", said)
 
 
-def test_antenna_delays_are_not_invented(folder):
-    uwblink.load(folder / "fly/d.uwb").save(folder / "written.uwb", force=True)
+def test_antenna_delays_are_not_invented(folder, fly):
+    fly.save(folder / "written.uwb", force=True)
     for name in ("fly/d.uwb", "written.uwb"):
         assert "antenna_delay" not in processes.succeed("uwblink", "show", folder / name).stdout
-
-
-def test_an_anchor_with_itself_is_named(folder):
-    contents = uwblink.load(folder / "fly/d.uwb")
-    same = {**contents.differences, "plus": contents.differences["minus"]}
-    replace(contents, differences=same).save(folder / "same.uwb", force=True)
-    processes.refuse("calib", "fit", "same.uwb", "-o", "x.json", *FIT, cwd=folder, naming=["same.uwb", "at both ends"])
 
 
 def test_undetermined_differences_are_not_corrected(folder):
@@ -153,15 +151,14 @@ def test_a_tag_is_localized_by_differences(folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["constant-velocity", "imu"])
-def test_the_tag_is_tracked_on_board(folder, model):
-    contents = uwblink.load(folder / "fly/d.uwb").select(stop_s=6.0)
+def test_the_tag_is_tracked_on_board(folder, fly, model):
     time_s = np.arange(0, 20.0, 0.01)
     swing = np.column_stack([2.5 * np.sin(0.5 * time_s), 2.2 * np.cos(0.37 * time_s), 0.7 * np.sin(0.29 * time_s)])
     force = -(np.array([0.5, 0.37, 0.29]) ** 2) * swing + [0.0, 0.0, 9.80665]
     columns = dict(zip(("ax", "ay", "az"), force.T, strict=True)) | dict.fromkeys(("wx", "wy", "wz"), np.zeros(2000))
     imu = {"time_ns": np.rint(time_s * 1e9).astype(np.int64), "body": np.full(2000, "tag20"), **columns}
     settings = calib.OnboardSettings(model=model, use="receptions")
-    (found,) = calib.localize_onboard(replace(contents, imu=imu), folder / "fit.json", settings)
+    (found,) = calib.localize_onboard(replace(fly.select(stop_s=6.0), imu=imu), folder / "fit.json", settings)
     assert found.used == "differences of arrival" + (", imu" if model == "imu" else "")
     assert not found.restarts_s
     assert found.rmse_m < {"constant-velocity": 0.1, "imu": 0.06}[model]
@@ -207,9 +204,8 @@ def test_the_wrong_sign_is_detected_with_poses(folder, words):
         (100.0, True, "longer than the distances of their anchors"),
     ],
 )
-def test_another_unit_or_sign_is_found_before_a_fit(folder, factor, blind, words):
-    some = uwblink.load(folder / "fly/d.uwb")
-    some = replace(some, poses=some.poses[some.poses.body != "tag20"]) if blind else some
+def test_another_unit_or_sign_is_found_before_a_fit(fly, factor, blind, words):
+    some = replace(fly, poses=fly.poses[fly.poses.body != "tag20"]) if blind else fly
     assert [one.fault for one in calib.examine(some)] == ["differences alone"]
     other = {**some.differences, "difference_m": factor * some.differences["difference_m"]}
     (found,) = calib.examine(replace(some, differences=other))
@@ -219,12 +215,11 @@ def test_another_unit_or_sign_is_found_before_a_fit(folder, factor, blind, words
         calib.load_ranges(replace(some, differences=other), need_power=False, use="receptions")
 
 
-def test_numbers_that_are_no_differences_are_left_out_and_counted(folder):
-    some = uwblink.load(folder / "fly/d.uwb")
-    other = some.differences["difference_m"].copy()
+def test_numbers_that_are_no_differences_are_left_out_and_counted(fly):
+    other = fly.differences["difference_m"].copy()
     other[::50] = np.resize([1e300, -1e300, np.nan], len(other[::50]))
     found = calib.load_ranges(
-        replace(some, differences={**some.differences, "difference_m": other}), need_power=False, use="receptions"
+        replace(fly, differences={**fly.differences, "difference_m": other}), need_power=False, use="receptions"
     )
     assert found.excluded["no range within 10 km"] == 64
 
@@ -255,26 +250,28 @@ def test_options_that_exclude_differences_are_refused(folder, words, naming, sta
 
 
 @pytest.mark.parametrize(
-    "words", [("fit", "-o", "x.json", *FIT), ("localize", "-c", "fit.json", "--use", "receptions")]
+    ("words", "plus", "naming"),
+    [
+        (("fit", "-o", "x.json", *FIT), 77, ["anchor 77", "no position"]),
+        (("localize", "-c", "fit.json", "--use", "receptions"), 77, ["anchor 77", "no position"]),
+        (("fit", "-o", "x.json", *FIT), None, ["at both ends"]),
+    ],
 )
-def test_an_anchor_without_a_place_is_named(folder, words):
-    contents = uwblink.load(folder / "fly/d.uwb")
-    lost = contents.differences["plus"].copy()
-    lost[7] = 77
-    replace(contents, differences={**contents.differences, "plus": lost}).save(folder / "lost.uwb", force=True)
-    naming = ["lost.uwb", "anchor 77", "no position"]
-    processes.refuse("calib", words[0], "lost.uwb", *words[1:], cwd=folder, naming=naming, status=2)
+def test_an_anchor_without_a_place_or_with_itself_is_named(folder, fly, words, plus, naming):
+    wrong = {name: column.copy() for name, column in fly.differences.items()}
+    wrong["plus"][7] = wrong["minus"][7] if plus is None else plus
+    replace(fly, differences=wrong).save(folder / "wrong.uwb", force=True)
+    processes.refuse("calib", words[0], "wrong.uwb", *words[1:], cwd=folder, naming=["wrong.uwb", *naming], status=2)
 
 
 @pytest.mark.slow
-def test_ranges_and_differences_are_used_together_and_fitted_apart(folder):
-    contents = uwblink.load(folder / "fly/d.uwb")
+def test_ranges_and_differences_are_used_together_and_fitted_apart(folder, fly):
     time_s = np.arange(0.1, 19.0, 0.1)
     truth = np.linalg.norm(ANCHORS[0] - place_m(time_s), axis=1)
     none: Any = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(len(time_s), dtype=np.int64))
     when_ns = np.rint(time_s * 1e9).astype(np.int64)
     ranges = uwblink.Exchanges.from_arrays(TAG, 1, time_ns=when_ns, protocol="ss", range_m=truth, **none)
-    both = replace(contents, exchanges=ranges)
+    both = replace(fly, exchanges=ranges)
     with pytest.raises(calib.CalibError, match="fit them separately"):
         calib.fit(both, use="receptions", delays_only=True)
     known = replace(
@@ -290,14 +287,13 @@ def test_ranges_and_differences_are_used_together_and_fitted_apart(folder):
     assert found.rmse_m["variance"].mean() < 0.045
 
 
-def test_a_recording_keeps_bare_differences(folder):
-    contents = uwblink.load(folder / "fly/d.uwb")
+def test_a_recording_keeps_bare_differences(folder, fly):
     for words in ("export fly/d.uwb --to csv -o exported", "import exported exported -o again.uwb"):
         processes.succeed("uwblink", *words.split(), cwd=folder)
     again = uwblink.load(folder / "again.uwb").differences
-    assert all(np.array_equal(again[name], column) for name, column in contents.differences.items())
-    some = contents.select(start_s=5.0, stop_s=6.0).differences
-    assert (len(some["time_ns"]), some["time_ns"][0]) == (160, contents.differences["time_ns"][0] + 5 * 10**9)
+    assert all(np.array_equal(again[name], column) for name, column in fly.differences.items())
+    some = fly.select(start_s=5.0, stop_s=6.0).differences
+    assert (len(some["time_ns"]), some["time_ns"][0]) == (160, fly.differences["time_ns"][0] + 5 * 10**9)
     assert "also: differences 3200" in processes.succeed("uwblink", "show", "fly/d.uwb", cwd=folder).stdout
 
 

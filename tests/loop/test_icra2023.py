@@ -5,12 +5,12 @@ import json
 
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
 
 from benchmarks.accuracy import LOSSES, one
 from calib import Calibration, load_calibration, load_ranges
 from calib.data.ranges import concatenate
 from tests import processes
+from tests.calib import synthetic
 from tests.shared_data import ROOT, shared
 from uwblink import SPEED_OF_LIGHT, Recording
 
@@ -37,17 +37,6 @@ def calibration(flights) -> Calibration:
     return load_calibration(flights / "calibration.json")
 
 
-@pytest.fixture(scope="module")
-def planted(flights):
-    with Recording.open(flights / "train.uwb") as recording:
-        return recording.meta()["planted"]
-
-
-def common_shift_ns(calibration, planted):
-    """Return the shift common to all delays, which has the same effect as a constant of the curve (see theory.md)."""
-    return np.mean([calibration.delays_ns[int(t)] - d for t, d in planted["delays_ns"].items()])
-
-
 def test_flights_have_the_size_of_those_of_the_paper(flights):
     sizes = {name: len(load_ranges(flights / f"{name}.uwb")) for name in ("train", "test1", "test2")}
     assert 36_000 < sizes["train"] < 40_000
@@ -64,23 +53,14 @@ def test_raw_errors_resemble_the_paper(flights):
     assert np.mean(((error - np.mean(error)) / np.std(error)) ** 3) > 1, "the tail is positive"
 
 
-def test_planted_delays_are_found_within_30_ps(calibration, planted):
-    shift = common_shift_ns(calibration, planted)
-    for tag, delay in planted["delays_ns"].items():
-        assert calibration.delays_ns[int(tag)] - shift == pytest.approx(delay, abs=0.030), tag
+def test_planted_delays_and_curve_are_found_within_30_ps_and_5_mm_rms(flights):
+    found = evaluated(flights / "train.uwb", flights / "calibration.json")["planted"]
+    assert max(map(abs, found["delay_error_ns"].values())) < 0.030
+    assert found["curve_rms_m"] < 0.005
 
 
-def test_planted_bias_curve_is_found_within_5_mm_rms(flights, calibration, planted):
-    curve = planted["bias_curve"]
-    knots = np.array(curve["knots"])
-    spline = BSpline(knots, np.array(curve["coefficients"]), curve["degree"])
-    lo, hi = calibration.bias_curve.range
-    lifted = calibration.lifted(load_ranges(flights / "train.uwb"))
-    populated = np.sort(lifted[(lifted >= lo) & (lifted <= hi)])
-    truth = spline(np.clip(populated, knots[0], knots[-1]))
-    fitted = calibration.bias_curve(populated)
-    shift_m = common_shift_ns(calibration, planted) * 1e-9 * SPEED_OF_LIGHT
-    assert np.sqrt(np.mean((fitted - shift_m - truth) ** 2)) < 0.005
+def evaluated(recording, calibration):
+    return json.loads(run("calib", "evaluate", recording, "-c", calibration, "--json"))
 
 
 def test_each_stage_of_the_recipe_reduces_the_errors(flights, tmp_path):
@@ -89,8 +69,7 @@ def test_each_stage_of_the_recipe_reduces_the_errors(flights, tmp_path):
     for name in ("test1", "test2"):
         mean = {}
         for calibration in (recipe, flights / "calibration.json"):
-            text = run("calib", "evaluate", flights / f"{name}.uwb", "-c", calibration, "--json")
-            overall = json.loads(text)["overall"]
+            overall = evaluated(flights / f"{name}.uwb", calibration)["overall"]
             mean[calibration] = {stage: abs(overall[stage]["mean_m"]) for stage in ("raw", "delays", "full")}
         # The delays of a joint fit refer to one power, so only those of the recipe can be used without a curve.
         assert mean[recipe]["raw"] > mean[recipe]["delays"]
@@ -116,16 +95,16 @@ def test_fit_does_not_read_what_was_planted(flights, tmp_path):
     assert (tmp_path / "copy.json").read_bytes() == (tmp_path / "whole.json").read_bytes()
 
 
-def test_powers_and_errors_by_power_are_those_of_the_papers_samples(flights, planted):
+def test_powers_and_errors_by_power_are_those_of_the_papers_samples(flights):
     """The samples are half of the paper's training flight, after antenna delays and the rejection of outliers.
 
     Here planted delays are removed, and errors beyond 3.9 standard deviations at their power, as there.
     """
     lifted, bias = np.loadtxt(shared("icra2023_bias_fpp.csv"), delimiter=",", skiprows=1).T
     r = load_ranges(flights / "train.uwb")
-    delay = np.array([planted["delays_ns"].get(str(tag), 0.0) for tag in range(7)]) * 1e-9
+    delay = np.array([r.planted["delays_ns"].get(str(tag), 0.0) for tag in range(7)]) * 1e-9
     weighted = r.weight_initiator * delay[r.initiator] + r.weight_target * delay[r.target]
-    error, mine = r.raw_m + SPEED_OF_LIGHT * weighted - r.truth_m, lift(r)
+    error, mine = r.raw_m + SPEED_OF_LIGHT * weighted - r.truth_m, synthetic.lifted(r.fpp1_dbm, r.fpp2_dbm)
     # Flights differ in rooms and durations: 2 % of lifted power in the bulk, 5 % at the ends.
     np.testing.assert_allclose(np.quantile(mine, [0.05, 0.5, 0.95]), np.quantile(lifted, [0.05, 0.5, 0.95]), atol=0.06)
     assert mine.max() < 1.6
@@ -136,10 +115,6 @@ def test_powers_and_errors_by_power_are_those_of_the_papers_samples(flights, pla
         ours = clipped(error[(mine >= low) & (mine < high)])
         assert np.std(ours) == pytest.approx(np.std(theirs), abs=0.012), (low, high)
         assert np.mean(ours) == pytest.approx(np.mean(theirs), abs=0.012), (low, high)
-
-
-def lift(r):
-    return (10 ** ((r.fpp1_dbm + 82) / 10) + 10 ** ((r.fpp2_dbm + 82) / 10)) / 2
 
 
 def clipped(error):

@@ -12,17 +12,14 @@ import tomllib
 import numpy as np
 import pytest
 from scipy.interpolate import BSpline
-from typer.testing import CliRunner
 
 import calib
 import uwblink
 import uwbsim
 from calib.calibration.model import load_calibration
-from calib.cli.commands import app as calib_app
 from calib.surveys.knowledge import load_knowledge
-from tests import pages
+from tests import pages, processes
 from tests.shared_data import ROOT
-from uwblink.cli.commands import app as uwblink_app
 from uwblink.pages import figures
 from uwbsim.boards.server import stays_s
 from uwbsim.scenario.radio import BIAS
@@ -61,7 +58,7 @@ class Bench:
         begin_s, end_s = next(self.stays)
         self.ports.bench.advance(int(begin_s * 1e9))
         names = [name for word in words for name in (self.ports.names.values() if "*" in word else [word])]
-        done = CliRunner().invoke(uwblink_app, names)
+        done = processes.succeed("uwblink", *names)
         assert self.ports.now_s() < end_s
         return done
 
@@ -83,8 +80,7 @@ def done(tmp_path_factory):
                 bench = Bench(words[1], words[words.index("--link-dir") + 1])
                 patch.setattr("uwblink.boards.record.SerialPorts", lambda ports=bench.ports: ports)
                 continue
-            result = bench.record(words) if name == "uwblink" else CliRunner().invoke(calib_app, words)
-            assert result.exit_code == 0, (name, words, result.output, result.exception)
+            result = bench.record(words) if name == "uwblink" else processes.succeed(name, *words)
             said.setdefault(words[0], result.stdout)
     return folder, said
 

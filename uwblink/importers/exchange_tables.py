@@ -192,7 +192,10 @@ def _note_assumptions(staging: Staging) -> None:
     if names := staging.names:
         # The first dozen; the recording has all, as bodies of its tags.
         some = first_few((f"{name[:20]} = {number}" for number, name in names.items()), 12)
-        staging.notes.append(f"{len(names)} ids are words or too large, and were numbered: {some}")
+        staging.notes.append(
+            f"{len(names)} ids are words or too large, and were numbered: {some}; another file may get other numbers, "
+            f"so give them in [ids] of the map if you use several files"
+        )
     if staging.blanks:
         total = staging.offsets[-1]
         staging.notes.append(f"{staging.blanks} of {total} rows or cells have no range, and are left out")

@@ -135,7 +135,8 @@ _AT_DEVICE: Final = {"resp": 1, "responder": 1, "target": 1, "anchor": 1, "init"
 
 def plain_name(header: str) -> str:
     """Return a name in lower case without accents, its words joined by `_`: `first_path_1_dbm`."""
-    bare = unicodedata.normalize("NFKD", header.replace("ß", "ss")).encode("ascii", "ignore").decode()
+    spelled = header.translate({ord("ß"): "ss", ord("µ"): "u", ord("μ"): "u"})  # the micro sign, and the Greek letter
+    bare = unicodedata.normalize("NFKD", spelled).encode("ascii", "ignore").decode()
     return re.sub(r"[^a-z0-9]+", "_", bare.lower()).strip("_")
 
 
@@ -341,6 +342,6 @@ def units_in(columns: dict[str, str], names: Iterable[str], units: Iterable[str]
 
 def unit_in(header: str, units: Iterable[str]) -> str | None:
     """Return the unit at the end of a name such as `range_mm` or `time [ns]`, None without one."""
-    last = re.split(r"[^a-z0-9]+", header.lower().strip(")] "))[-1]
+    last = plain_name(header).split("_")[-1]
     last = {"tick": "ticks", "dtu": "ticks", "sec": "s"}.get(last, last)
     return last if last in units and last != header.lower() else None

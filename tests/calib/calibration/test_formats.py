@@ -97,43 +97,39 @@ def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
     # A tag that was not fitted: nothing is known of its pairs.
     known = replace(fitted, delays_ns=DELAYS_NS | {50: 0.1}, **change)
     random, tags = np.random.default_rng(8), sorted(known.delays_ns)
-    rows = [
-        (float(r), float(a), float(b), *map(int, random.choice(tags, 2, replace=False)))
-        for r, a, b in zip(random.uniform(0, 50, 500), *random.uniform(-110, -70, (2, 500)), strict=True)
-    ]
-    one, two = tags[:2]
-    rows += [(1.0, 0.0, -85.0, one, two), (1.0, -85.0, math.nan, one, two), (1.0, 0.0, 0.0, one, two)]
+    one, two, ends = *tags[:2], np.array([random.choice(tags, 2, replace=False) for _ in range(500)])
+    rows = np.column_stack([random.uniform(0, 50, 500), *random.uniform(-110, -70, (2, 500)), ends])
+    # Powers that are missing, and a tag that the calibration does not have.
+    rows = np.vstack([rows, *[(1.0, *powers, one, two) for powers in ((0, -85), (-85, math.nan), (0, 0))]])
     away = random.normal(size=(len(rows), 2, 3))
     # With the precision of `Ranges`, both sides have equal numbers; every tenth direction is unknown.
     away = (away / np.linalg.norm(away, axis=2, keepdims=True)).astype(np.float32)
     away.reshape(-1, 3)[::10] = math.nan
-    every = [*rows, (1.0, -85.0, -85.0, 9999, one)]
-    lines = "\n".join(
-        " ".join(map(str, (*row, *map(float, toward))))
-        for row, toward in zip(every, [*away.reshape(-1, 6), range(6)], strict=True)
-    )
-    told = printed(tmp_path, known, MAIN, lines).splitlines()
-    found = [(status, *map(float, numbers)) for status, *numbers in map(str.split, told)]
-    assert len(found) == len(rows) + 1
-    for row, toward, (status, corrected, sigma, *told) in zip(rows, away, found, strict=False):
-        if sum(known.sides.get(tag, 0) for tag in row[3:]):
-            assert status == "-1"
-            with pytest.raises(calib.BadInputError, match="cannot correct"):
-                known.correct(*row)
-            continue
-        blind = known.correct(*row)
-        one_range = calib.Ranges.from_arrays(row[0], initiator=row[3], target=row[4], fpp1_dbm=row[1], fpp2_dbm=row[2])
-        seen = known.apply(replace(one_range, toward=toward[None]))
-        other = (blind.range_m, blind.sigma_total_m, seen.mean_error_m[0], seen.tail_share[0])
-        assert told == pytest.approx((seen.sigma_total_m[0], *other), abs=1e-12, nan_ok=True)
-        # Without a power, a range is corrected for delays only.
-        assert corrected == pytest.approx(seen.corrected_m[0] if status != "2" else blind.range_m, abs=1e-12)
-        assert sigma == pytest.approx(blind.sigma_m, abs=1e-12, nan_ok=True)
-        assert ((status == "1"), (status == "2")) == (blind.clamped, np.isnan(blind.sigma_m))
-    assert len({share for *_, share in found}) > 100, "shares differ by pair and power"
-    assert ({status for status, *_ in found}, found[-1][0]) == ({"0", "1", "2", "-1"}, "-1")
-    corrected, blind = np.array([(one[1], one[4]) for one in found], dtype=float).T
-    assert np.mean(np.abs(corrected - blind) > 1e-3) == pytest.approx(0.9 if known.patterns else 0.0, abs=0.15)
+    lines = [f"{r!r} {a!r} {b!r} {i:.0f} {j:.0f}" for r, a, b, i, j in [*rows.tolist(), (1.0, -85.0, -85.0, 9999, one)]]
+    toward = [" ".join(map(str, six)) for six in [*away.reshape(-1, 6).astype(float).tolist(), range(6)]]
+    text = "\n".join(f"{line} {six}" for line, six in zip(lines, toward, strict=True))
+    *found, strange = (line.split() for line in printed(tmp_path, known, MAIN, text).splitlines())
+    status, values = np.array(found)[:, 0], np.array(found, dtype=float)[:, 1:]
+    ends = rows[:, 3:].astype(int)
+    undetermined = np.array([sum(known.sides.get(tag, 0) for tag in pair) != 0 for pair in ends.tolist()])
+    assert (strange[0], set(status[undetermined]) <= {"-1"}, len(found)) == ("-1", True, len(rows))
+    if undetermined.any():
+        with pytest.raises(calib.BadInputError, match="cannot correct"):
+            known.correct(*rows[undetermined, :3].T, *ends[undetermined].T)
+    some = ~undetermined
+    (range_m, fpp1, fpp2), (i, j), kinds = rows[some, :3].T, ends[some].T, status[some]
+    blind = known.correct(range_m, fpp1, fpp2, i, j)
+    seen = calib.Ranges.from_arrays(range_m, initiator=i, target=j, fpp1_dbm=fpp1, fpp2_dbm=fpp2)
+    there = known.apply(replace(seen, toward=away[some]))
+    # Without a power, a range is corrected for delays only.
+    corrected = np.where(kinds == "2", blind.range_m, there.corrected_m)
+    expected = (corrected, blind.sigma_m, there.sigma_total_m, blind.range_m, blind.sigma_total_m)
+    np.testing.assert_allclose(values[some].T, [*expected, there.mean_error_m, there.tail_share], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal([kinds == "1", kinds == "2"], [blind.clamped, np.isnan(blind.sigma_m)])
+    assert len(set(values[:, -1].tolist())) > 100, "shares differ by pair and power"
+    assert set(kinds) == {"0", "1", "2"}
+    changed = np.mean(np.abs(corrected - blind.range_m) > 1e-3)
+    assert changed == pytest.approx(0.9 if known.patterns else 0.0, abs=0.15)
 
 
 def test_miluv_is_read_and_given_back_unchanged():

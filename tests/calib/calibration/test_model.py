@@ -15,7 +15,7 @@ from calib.calibration.error_model import ErrorModel, PairErrors
 from calib.calibration.model import Calibration, TagGroup, load_calibration
 from tests.calib.synthetic import ranges
 from tests.processes import refuse, succeed
-from uwblink import SPEED_OF_LIGHT, Contents, Recording
+from uwblink import SPEED_OF_LIGHT, Contents, Exchanges, Recording
 from uwblink.recording.schema import TABLES, CirRow, Fault, FrameRow
 
 
@@ -204,6 +204,21 @@ def test_a_corrected_recording_is_not_corrected_again(corrected):
     assert not (folder / "again.uwb").exists()
 
 
+def test_corrected_ranges_without_stamps_are_not_corrected_again(tmp_path):
+    flight = calib.sample_flight(300)
+    known, e = calib.fit(flight).calibration, flight.exchanges
+    columns = {name: getattr(e, name) for name in ("range_m", "time_ns", "fpp1_dbm", "fpp2_dbm")}
+    bare = Exchanges.from_arrays(e.initiator, e.target, **columns)
+    replace(flight, exchanges=bare).save(tmp_path / "f.uwb")
+    known.save(tmp_path / "k.json")
+    calib.apply(tmp_path / "f.uwb", known, tmp_path / "c.uwb")
+    assert calib.evaluate(tmp_path / "f.uwb", known).overall.full.n == 300
+    for command in (["evaluate"], ["localize"], ["fit", "-o", tmp_path / "again.json"]):
+        use = [] if command[0] == "fit" else ["-c", tmp_path / "k.json"]
+        refuse("calib", *command, tmp_path / "c.uwb", *use, naming=["c.uwb", "already corrected"])
+    assert not (tmp_path / "again.json").exists()
+
+
 def test_a_recording_without_exchanges_is_corrected_to_one_without(tmp_path):
     flight = calib.sample_flight(600)
     Contents(exchanges=flight.exchanges[:0], tags=flight.tags).save(tmp_path / "f.uwb")
@@ -300,6 +315,7 @@ def test_error_models_are_read_unchanged_and_may_be_missing(error_fitted):
         ("pairs", {"1-2": {"noise": 1.0, "odds": 0.0, "detour": 1.0}}, "1-2: odds"),
         ("levels", [[0.1]], "levels"),
         ("scale", "wide", "scale"),
+        ("long_share", 1.5, "long_share"),
     ],
 )
 def test_a_damaged_model_is_one_clear_error(error_fitted, key, value, said):
@@ -398,9 +414,8 @@ def test_undetermined_pairs_are_named_and_other_pairs_corrected(tmp_path):
     assert "left out" not in whole.stderr
     assert [line for line in part.stderr.splitlines() if all(pair in line for pair in named)]
     assert f"{np.count_nonzero(~across)} ranges are left out" in part.stderr
-    for name in ("two.uwb", "one.uwb"):
-        assert rows(tmp_path / name, "corrected") == rows(tmp_path / "one.uwb", "corrected")
-        assert rows(tmp_path / name, "exchanges") == rows(tmp_path / "one.uwb", "exchanges")
+    for table in ("corrected", "exchanges"):
+        assert rows(tmp_path / "two.uwb", table) == rows(tmp_path / "one.uwb", table)
     # Evaluation and localization also leave these pairs out.
     for command in (("evaluate",), ("localize", "--seeds", 1)):
         said = [succeed("calib", *command, name, "-c", "c.json", cwd=tmp_path) for name in ("across.uwb", "all.uwb")]

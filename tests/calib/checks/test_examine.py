@@ -13,6 +13,7 @@ import calib
 import uwbsim
 from benchmarks import doctor as planted
 from benchmarks.flights import LIGHT, Plan, fly
+from tests.processes import succeed
 from uwblink import Contents
 
 pytestmark = pytest.mark.slow
@@ -382,6 +383,17 @@ def test_true_distances_of_the_poses_hold_in_the_middle_of_long_exchanges():
     truth_m = calib.Ranges.from_exchanges(wrong.exchanges, poses=wrong.poses, tags=wrong.tags).truth_m
     found = only(planted.changed(wrong, truth_m=truth_m), "anchor stands elsewhere")
     assert found.evidence.startswith("ranges with anchor1 fit a position")  # not "by the poses, ..."
+
+
+def test_recordings_of_the_same_time_can_be_examined(tmp_path):
+    later = 1_700_000_000 * 10**9  # host times, as of two parts of one session
+    files = [tmp_path / "a.uwb", tmp_path / "b.uwb"]
+    for file, seed in zip(files, (98, 99), strict=True):
+        one = fly(replace(SHORT, bodies=3, anchors=4, seconds=60), seed)
+        e = replace(one.exchanges, time_ns=one.exchanges.time_ns + later)
+        poses = replace(one.poses, time_ns=one.poses.time_ns + later)
+        Contents(exchanges=e, poses=poses, tags=one.tags).save(file)
+    assert "nothing found" in succeed("calib", "doctor", *files).stdout
 
 
 def test_true_distances_of_a_displaced_anchor_are_named():

@@ -10,7 +10,7 @@ import calib
 import uwbsim
 from benchmarks.worlds import CLEAN, PLANTED, Recipe, make
 from tests.calib.fitting.fields import ranges_with_field
-from tests.calib.synthetic import about_their_mean
+from tests.calib.synthetic import about_their_mean, lifted
 
 pytestmark = pytest.mark.slow
 
@@ -78,12 +78,8 @@ def test_sound_worlds_have_no_warnings(name):
 
 
 def test_shares_of_reflections_by_pair_do_not_bias_delays():
-    errors = []
-    for seed in range(3):
-        world = make(CLEAN["share by pair"], seed)
-        delays = calib.fit(world.ranges).calibration.delays_ns
-        error = np.array([delays[tag] - known for tag, known in world.delays_ns.items()])
-        errors.append(error - error.mean())
+    worlds = [make(CLEAN["share by pair"], seed) for seed in range(3)]
+    errors = [about_their_mean(calib.fit(one.ranges).calibration, one.delays_ns)[0] for one in worlds]
     # With one share for all pairs it is 20 ps; the bound is 15 ps, and 5 ps are found.
     assert np.sqrt(np.mean(np.square(errors))) < 0.010
 
@@ -94,10 +90,8 @@ def test_short_recordings_with_persistent_errors_have_a_warning():
 
 
 def test_intervals_cover_the_truth_if_errors_persist():
-    scores = []
-    for seed in range(5):
-        world = make(CLEAN["persistent 1 s, 2 cm over 3 s, 90 s"], seed)
-        scores.append(wrong(world, calib.fit(world.ranges)))
+    worlds = [make(CLEAN["persistent 1 s, 2 cm over 3 s, 90 s"], seed) for seed in range(5)]
+    scores = [wrong(world, calib.fit(world.ranges)) for world in worlds]
     # Of 25 errors, 24 should be within two standard errors; with blocks of time of a fixed length it would be 16.
     assert np.mean(np.abs(scores) < 1.96) > 0.85
 
@@ -127,9 +121,8 @@ def test_distances_in_a_wrong_unit_are_named():
 def test_sequential_fits_do_not_take_the_curve_for_walls():
     """The errors of all ranges between two bodies contain the curve, which is fitted after the delays."""
     ranges = ranges_with_field(60_005, bodies=3, seconds=60)[0]
-    lifted = np.mean(10 ** ((np.array([ranges.fpp1_dbm, ranges.fpp2_dbm]) + 82) / 10), axis=0)
-    ranges = replace(ranges, raw_m=ranges.raw_m + 0.15 * np.exp(-lifted / 0.4))
-    said = calib.fit(ranges, sequential=True).warnings
+    curve = 0.15 * np.exp(-lifted(ranges.fpp1_dbm, ranges.fpp2_dbm) / 0.4)
+    said = calib.fit(replace(ranges, raw_m=ranges.raw_m + curve), sequential=True).warnings
     assert not any("places" in one or "with the distance" in one for one in said)
 
 

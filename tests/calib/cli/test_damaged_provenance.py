@@ -13,7 +13,7 @@ from tests import processes
 def surveyed(tmp_path_factory):
     """Return a recording and the document of a survey of its tags."""
     folder = tmp_path_factory.mktemp("surveyed")
-    assert processes.run("calib", "sample", "-o", folder / "a.uwb", "-n", "900").returncode == 0
+    processes.succeed("calib", "sample", "-o", folder / "a.uwb", "-n", "900")
     found = calib.survey(calib.sample_arrangements(), known="line").calibration
     return folder / "a.uwb", json.loads(found.to_json())
 

@@ -1,4 +1,4 @@
-"""Extensions of the estimator by a contributor: an unknown, a part and a kind of row; and an oracle."""
+"""Extensions of the estimator by a contributor: an unknown, a part and a kind of row."""
 
 from dataclasses import replace
 from typing import Any
@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from benchmarks.worlds import CLEAN, make
-from calib.estimator.known_distances import model_of, robust_fit
-from calib.settings import FitSettings
 from tests import pages
 
 PER_KELVIN_M = 0.004
@@ -52,13 +50,3 @@ def test_a_new_kind_of_row_needs_one_class(climbed):
     # Sheet and ranges have equal weight: the result is halfway, and its deviation is smaller by the root of two.
     assert value == pytest.approx((alone + 0.003) / 2, abs=0.2 * std)
     assert both == pytest.approx(std / np.sqrt(2), rel=0.1)
-
-
-def test_least_squares_with_delays_alone_agrees_with_numpy():
-    model = model_of(make(CLEAN["short, 30 s"], 12_002).ranges, FitSettings(delays_only=True))
-    error = model.ranges.raw_m - model.ranges.truth_m
-    found = robust_fit(model, error, "l2", None, ("delay",))
-    weights = [(model.ranges.initiator[:, None] == model.tags) * model.ranges.weight_initiator[:, None],
-               (model.ranges.target[:, None] == model.tags) * model.ranges.weight_target[:, None]]  # fmt: skip
-    expected = -np.linalg.lstsq(sum(weights) * 0.299702547, error, rcond=None)[0]
-    np.testing.assert_allclose(found.optimum.of("delay"), expected, atol=2e-6)

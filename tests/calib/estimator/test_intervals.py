@@ -22,9 +22,10 @@ def fitted(recipe, seed=12_003, **settings):
     return fit_known_distances(make(recipe, seed).ranges, calib.FitSettings(**settings))
 
 
-def test_variances_account_for_fitted_unknowns():
+def test_least_squares_of_delays_alone_and_its_variances_agree_with_numpy():
     model = model_of(make(CLEAN["short, 30 s"], 12_004).ranges[:400], calib.FitSettings(delays_only=True))
-    found = robust_fit(model, model.ranges.raw_m - model.ranges.truth_m, "l2", None, ("delay",))
+    error = model.ranges.raw_m - model.ranges.truth_m
+    found = robust_fit(model, error, "l2", None, ("delay",))
     delays = found.optimum.layout.indices(["delay"])
     cut = time_blocks(model.ranges.time_ns, model.ranges.session)
     kept = {"delay": Kept.delays(delays, 1e9, model.held)}
@@ -34,6 +35,7 @@ def test_variances_account_for_fitted_unknowns():
     tags, ranges = np.array(model.tags), model.ranges
     weights = ((ranges.initiator, ranges.weight_initiator), (ranges.target, ranges.weight_target))
     matrix = sum((ids[:, None] == tags) * weight[:, None] for ids, weight in weights) * 0.299702547
+    np.testing.assert_allclose(found.optimum.of("delay"), -np.linalg.lstsq(matrix, error)[0], atol=2e-6)
     scores = matrix * found.residuals[:, None]
     sums = np.array([scores[cut.number == k].sum(axis=0) for k in range(cut.count)])
     inverse = np.linalg.inv(matrix.T @ matrix)
@@ -66,7 +68,11 @@ def test_intervals_of_few_ranges_cover_the_truth():
     scores = []
     for seed in range(12):
         some = synthetic.ranges(n=100, noise_m=0.05, tail=0, seed=seed)
-        flat = replace(some, raw_m=some.raw_m - synthetic.bias_m(lifted(some)), time_ns=20 * some.time_ns)
+        flat = replace(
+            some,
+            raw_m=some.raw_m - synthetic.bias_m(synthetic.lifted(some.fpp1_dbm, some.fpp2_dbm)),
+            time_ns=20 * some.time_ns,
+        )
         known = calib.fit(flat, loss="l2").calibration
         scores.append(np.divide(*synthetic.about_their_mean(known, synthetic.DELAYS_NS)))
     # Twelve fits with three differences of delays each determine a standard deviation to 12 %. Testing for persistence
@@ -82,10 +88,6 @@ def test_times_in_microseconds_for_nanoseconds_do_not_narrow_intervals():
     widths = [np.mean(list(found.calibration.delays_std_ns.values())) for found in (sound, hasty)]
     assert widths[1] > 0.75 * widths[0]
     assert [said for said in hasty.warnings if "s of data" in said]
-
-
-def lifted(ranges):
-    return np.mean([10 ** ((power + 82) / 10) for power in (ranges.fpp1_dbm, ranges.fpp2_dbm)], axis=0)
 
 
 def blocks(count, seconds):

@@ -11,6 +11,7 @@ from scipy.interpolate import BSpline
 import calib
 from calib.data.sources import load_flight
 from calib.evaluation import Settings, localization_json, localization_text, summarize
+from calib.evaluation.filters import IMUS
 from calib.evaluation.models import FilterRanges
 from calib.evaluation.tracking import problems, run_filters
 from tests import processes
@@ -45,7 +46,7 @@ def flight(seed, duration_s, *, pairs=BETWEEN_ANCHORS, passive=ROBOT, radio=None
                 "ranging": {"protocol": "ds", "rate_hz": 160.0, "pairs": pairs},
                 "radio": quiet | (NOISY if radio is None else radio),
                 "mocap": {"rate_hz": 100.0},
-                "bodies": [*anchors, {"name": "robot", "motion": robot}],
+                "bodies": [*anchors, {"name": "robot", "motion": robot, "imu": {"grade": "industrial"}}],
                 "tags": tags,
             }
         )
@@ -135,23 +136,6 @@ def test_a_robot_that_never_sends_is_localized(known, heard):
 
 
 @pytest.mark.slow
-def test_the_filter_includes_common_errors_of_listeners(heard):
-    (problem,), rng = problems(load_flight(heard)), np.random.default_rng(5)
-    true_m = problem.ranges.arrivals.truth_m[problem.rows - len(problem.ranges)]
-    drawn = 0.3 * rng.normal(size=len(problem.ranges))[problem.exchange] + 0.05 * rng.normal(size=len(true_m))
-    own, common = np.full(len(true_m), 0.05), np.full(len(true_m), 0.3)
-    means = list[float]()
-    for std, shared in ((own, common), (np.hypot(own, common), 0 * common)):
-        measured = {"variance": FilterRanges(true_m + drawn, std, shared, np.zeros_like(problem.sign))}
-        tracks = run_filters(problem, measured, replace(LISTEN, gate=1e9))["variance"]
-        means.append(float(np.mean([track.nees for track in tracks])))
-    # If they were taken for independent, two listeners would count as two exchanges, and the filter would be
-    # overconfident.
-    assert 2.5 < means[0] < 3.5
-    assert means[1] > 1.3 * means[0]
-
-
-@pytest.mark.slow
 def test_constants_of_both_pairs_in_a_difference_are_followed(heard):
     (problem,), rng = problems(load_flight(heard)), np.random.default_rng(6)
     true_m, zero = problem.ranges.arrivals.truth_m[problem.rows - len(problem.ranges)], np.zeros(len(problem))
@@ -209,6 +193,27 @@ def test_a_robot_on_board_is_helped_by_what_is_overheard(known, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_robot_that_never_sends_is_consistent_on_board_and_needs_no_true_poses(known, heard):
+    settings = calib.OnboardSettings(noise=IMUS["industrial"], use="receptions")
+    (track,) = calib.localize_onboard(heard, known, settings)
+    assert (track.used, track.restarts_s) == ("differences of arrival, imu", ())
+    assert len(track.nis) > 6350, "all 6400 differences but those of the start"
+    late, settled = (time_ns > track.time_ns[0] + 5 * 10**9 for time_ns in (track.time_ns, track.range_time_ns))
+    # Errors of the state last for a second: fifteen independent values of three.
+    assert 1.5 < np.mean(track.nees[late]) < 5.0
+    # Two listeners of an exchange have one error in common: the mean of 4800 squares is known to a thirtieth.
+    assert np.mean(track.nis[settled]) == pytest.approx(1.0, abs=0.09)
+    assert np.sqrt(np.mean(np.sum((track.estimate_m - track.truth_m)[late] ** 2, axis=1))) < 0.1
+    early = heard.select(stop_s=4.0)
+    (seen,), (blind,) = (
+        calib.localize_onboard(replace(early, poses=early.poses[rows]), known, settings)
+        for rows in (early.poses.body != "", early.poses.body != "robot")
+    )
+    assert np.isnan(blind.truth_m).all()
+    assert blind.estimate_m == pytest.approx(seen.estimate_m, abs=1e-9)
+
+
+@pytest.mark.slow
 def test_lasting_reflections_within_the_gate_are_in_the_covariance():
     """A gate of 3.3 standard deviations of a difference accepts errors of half a metre of both signs."""
     lasting = {"model": "two-state", "share": 0.14, "mean_excess_m": 0.35, "life_s": 0.15, "first_path_loss_db": 0.4,
@@ -241,7 +246,7 @@ def folder(tmp_path_factory):
     """A robot that listens, one that does not, and a calibration."""
     place = tmp_path_factory.mktemp("robots")
     for name, listening in (("listens", ROBOT), ("deaf", ())):
-        flight(3130, 0.5, passive=listening).save(place / f"{name}.uwb")
+        replace(flight(3130, 0.5, passive=listening), imu={}).save(place / f"{name}.uwb")
     PLANTED.save(place / "c.json")
     return place
 

@@ -16,7 +16,7 @@ from calib.evaluation.localization import write_tum
 from calib.evaluation.onboard import onboard_json, onboard_text
 from tests.calib import synthetic
 from tests.shared_data import miluv, shared
-from uwblink import Contents, Exchanges, Poses, Tag, raw_range
+from uwblink import Contents, Poses, Tag, raw_range
 from uwblink.importers import read_source
 
 ANCHORS = np.array([[3, 3, 0.3], [-3, 3, 2.2], [-3, -3, 0.4], [3, -3, 2.4], [0, 3.5, 1.2], [3.5, 0, 1.4]])
@@ -88,52 +88,6 @@ def flight(seconds=20.0, seed=1, reflected=0.0, rate=50.0, start=0.0):
         imu={"time_ns": (ti * 1e9).astype(np.int64) + ns, "body": np.full(len(ti), "drone"), **columns},
         height={"time_ns": (th * 1e9).astype(np.int64) + ns, "body": np.full(len(th), "drone"), "height_m": height},
     )
-
-
-def listening(seconds=20.0, seed=1, rate=50.0):
-    """Return the same flight, in which anchors range with each other and the tags of the body only listen: stamps by
-    formulas.
-
-    Receptions have independent noise such that ranges have `NOISE_M`, and clocks have different rates.
-    """
-    c, tick, reply, third = 299702547.0, 1 / (128 * 499.2e6), 0.4e-3, 1.5e-3
-    rng, found = np.random.default_rng(seed), flight(seconds, seed, rate=rate)
-    share, ns = reply / third, 10**12
-    noise_s = 2 * NOISE_M / np.sqrt(1 + (1 + share) ** 2 + share**2) / c
-    t = np.arange(0, seconds, 1 / rate)
-    i = rng.integers(0, len(ANCHORS), len(t))
-    j = (i + rng.integers(1, len(ANCHORS), len(t))) % len(ANCHORS)
-    between = np.linalg.norm(ANCHORS[i] - ANCHORS[j], axis=1) / c
-    clocks = 1 + rng.normal(0, 5e-6, 12), rng.uniform(0, 0.01, 12)
-
-    def stamp(tag, time):
-        return np.rint((clocks[1][tag] + clocks[0][tag] * (time + 1.0)) / tick).astype(np.int64) % 2**40
-
-    def late(place, time):
-        return time + np.linalg.norm(place - antennas(time), axis=1) / c + rng.normal(0, noise_s, len(time))
-
-    def antennas(time):
-        return place(time) + attitude(time).apply(np.tile(ARMS[me], (len(time), 1)))
-
-    response = t + between + reply
-    final = response + third
-    stamps = {"tx1": stamp(i, t), "rx1": stamp(j, t + between + rng.normal(0, noise_s, len(t)))}
-    stamps |= {"tx2": stamp(j, response), "tx3": stamp(j, final)}
-    for name, sent in (("rx2", response), ("rx3", final)):
-        stamps[name] = stamp(i, sent + between + rng.normal(0, noise_s, len(t)))
-    time_ns, power = (t * 1e9).astype(np.int64) + ns, np.full(len(t), -85.0)
-    exchanges = Exchanges.from_arrays(
-        i, j, **stamps, protocol="ds", time_ns=time_ns, fpp1_dbm=power, fpp2_dbm=power, bits=40
-    )
-    parts = []
-    for me in ARMS:
-        columns = {"time_ns": time_ns, "listener": np.full(len(t), me), "initiator": i, "target": j}
-        columns |= {f"{name}_n": column for name, column in stamps.items()}
-        for n, (sender, sent) in enumerate(((i, t), (j, response), (j, final)), 1):
-            columns |= {f"rx{n}": stamp(me, late(ANCHORS[sender], sent)), f"fpp{n}_dbm": power, f"skew{n}_ppm": power}
-        parts.append(columns)
-    overheard = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return replace(found, exchanges=exchanges, overheard=overheard)
 
 
 def calibration(share=0.001):
@@ -294,37 +248,6 @@ def test_recordings_without_needed_data_are_refused(change, settings, error, sai
     contents = flight(3.0)
     with pytest.raises(error, match=said):
         localize_onboard(replace(contents, **change(contents)), calibration(), OnboardSettings(**settings))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [41, 42, 43])
-def test_a_body_that_only_listens_is_localized_consistently(seed):
-    settings = OnboardSettings(noise=IMU, use="receptions")
-    (track,) = localize_onboard(listening(seed=seed), calibration(), settings)
-    assert track.used == "differences of arrival, imu, height"
-    assert len(track.nis) > 1980, "all 2000 differences but those of the start"
-    late = track.time_ns > track.time_ns[0] + 5_000_000_000
-    # Fifteen independent values of three, as above.
-    assert 1.5 < np.mean(track.nees[late]) < 5.0
-    settled = track.range_time_ns > track.time_ns[0] + 5_000_000_000
-    # Two listeners of an exchange have one error in common: the mean of 1500 squares is known to a twentieth.
-    assert np.mean(track.nis[settled]) == pytest.approx(1.0, abs=0.12)
-    assert np.sqrt(np.mean(errors_of(track, 5.0) ** 2)) < 0.1
-    assert track.restarts_s == ()
-
-
-@pytest.mark.slow
-def test_differences_need_no_true_poses():
-    heard = listening(8.0)
-    blind = replace(heard, poses=heard.poses[heard.poses.body != "drone"])
-    settings = OnboardSettings(noise=IMU, use="receptions")
-    ((known,), (track,)) = (localize_onboard(one, calibration(), settings) for one in (heard, blind))
-    assert np.isnan(track.truth_m).all()
-    assert track.estimate_m == pytest.approx(known.estimate_m, abs=1e-9)
-    with pytest.raises(UnanswerableError, match="receptions"):
-        localize_onboard(heard, calibration(), OnboardSettings(noise=IMU))
-    with pytest.raises(UnanswerableError, match="no listener overheard"):
-        localize_onboard(flight(8.0), calibration(), settings)
 
 
 def test_multilateration_is_exact_and_leaves_a_reflection_out():

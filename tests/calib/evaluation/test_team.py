@@ -15,11 +15,8 @@ import uwbsim
 from calib.calibration.patterns import Pattern
 from calib.data.samples import stamped
 from calib.errors import WeakHeadingWarning
-from calib.evaluation import team
 from calib.evaluation.filters import IMUS, ProcessNoise
-from calib.evaluation.models import FilterRanges
 from calib.evaluation.team import team_json, team_text
-from calib.evaluation.tracking import distances_in
 from tests import processes
 from tests.calib.synthetic import calibration
 from uwblink import Contents, Poses, Tag
@@ -263,27 +260,6 @@ def test_poses_after_the_start_are_only_for_evaluation(known):
         assert np.isnan(tracks[2].truth_m[-1]).all()
         assert (tracks[1].rmse_m > 1.0) == (body == 0)
         assert np.isfinite(tracks[2].rmse_m)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seeds", [(305,), (305, 306)], ids=len)
-def test_the_filter_includes_common_errors_of_listeners(known, monkeypatch, seeds):
-    def drawn(ranges, *_, **__):
-        rng, heard, count = np.random.default_rng(8), ranges.arrivals, len(ranges)
-        truth, nothing = np.append(ranges.truth_m, heard.truth_m), 0 * distances_in(ranges)[1]
-        wrong = np.append(0.2 * rng.normal(size=count), 0.05 * rng.normal(size=count)[heard.exchange])
-        own = np.append(np.full(count, 0.2), np.full(len(heard), 0.01))
-        common = np.append(np.zeros(count), np.full(len(heard), 0.05))
-        measured = truth + wrong + 0.01 * rng.normal(size=len(truth))
-        # For the filter called raw, listeners of an exchange are independent.
-        apart = FilterRanges(measured, np.hypot(own, common), 0 * common, nothing)
-        return {"raw": apart, "variance": FilterRanges(measured, own, common, nothing)}
-
-    monkeypatch.setattr(team, "filter_ranges", drawn)
-    ungated, flights = replace(LISTEN, gate=1e9), [simulated(seed, 6.0) for seed in seeds]
-    figures = team_json([one for each in flights for one in calib.localize_team(each, known, ungated)])["summary"]
-    assert 4.5 < figures["variance"]["nees"] < 7
-    assert figures["raw"]["nees"] > 1.3 * figures["variance"]["nees"]
 
 
 @pytest.mark.slow

@@ -28,6 +28,7 @@ def test_sides_that_pairs_leave_undetermined_are_named(pairs, splits):
     found = calib.fit(among(ranges(1200), pairs))
     assert found.calibration.undetermined_splits == splits
     assert ("only ranges between" in " ".join(found.warnings[:1])) == bool(splits)
+    assert calib.Calibration.from_json(found.calibration.to_json()) == found.calibration
     split = [tag for sides in splits for tags in sides for tag in tags]
     assert [tag for tag, std in found.calibration.delays_std_ns.items() if np.isinf(std)] == sorted(split)
 
@@ -84,6 +85,13 @@ def test_calibrations_of_two_sides_are_compared_by_what_they_determine():
     shifted = {1: 0.5, 2: 0.5, 3: -0.5, 7: -0.5}
     split = replace(part, delays_ns={tag: delay + shifted[tag] for tag, delay in part.delays_ns.items()})
     assert calib.compare(whole, split).chi_square == pytest.approx(found.chi_square, abs=1e-6)
+    # Of a single pair, only the ranges can be compared.
+    alone = calib.fit(among(ranges(3000), [(1, 2)])).calibration
+    pair = calib.compare(whole, alone)
+    assert (pair.verdict, pair.degrees, abs(pair.offset_m) < 0.02) == ("unknown", 0, True)
+    # With the smallest delays, both get the same share of the sum (K is one to a part in 10^5).
+    assert alone.delays_ns[1] == pytest.approx(alone.delays_ns[2], abs=1e-5)
+    assert '"1": null' in alone.to_json()
 
 
 def test_a_tag_joins_the_side_opposite_to_its_partners():

@@ -15,7 +15,7 @@ from calib.checks.limits import power_levels_db
 from calib.data.ranges import concatenate
 from tests.calib import synthetic
 from tests.calib.fitting.fields import ranges_with_field
-from tests.calib.synthetic import DELAYS_NS, about_their_mean, bias_m, ranges
+from tests.calib.synthetic import DELAYS_NS, about_their_mean, bias_m, lifted, ranges
 
 
 def apart(result, planted):
@@ -86,7 +86,7 @@ def world(sent=NOBODY, read=NOBODY, noise_db=0.0, lasting=None, **more):
     rng = np.random.default_rng(3)
     r = ranges(**({"n": 6000} | more))
     # The path loss is equal in both directions: both powers are reduced by the same.
-    r = replace(r, fpp2_dbm=r.fpp1_dbm, raw_m=r.raw_m + bent(r.fpp1_dbm) - lifted_bent(r))
+    r = replace(r, fpp2_dbm=r.fpp1_dbm, raw_m=r.raw_m + bent(r.fpp1_dbm) - bias_m(lifted(r.fpp1_dbm, r.fpp1_dbm)))
 
     def gain(table, tags):
         return np.array([table.get(tag, 0.0) for tag in range(8)])[tags]
@@ -107,10 +107,6 @@ def world(sent=NOBODY, read=NOBODY, noise_db=0.0, lasting=None, **more):
 def bent(power_dbm):
     """A curve of 12 mm per decibel."""
     return -0.012 * (power_dbm + 87)
-
-
-def lifted_bent(r):
-    return bias_m(np.mean(10 ** ((np.stack([r.fpp1_dbm, r.fpp2_dbm]) + 82) / 10), axis=0))
 
 
 def test_levels_are_exact_without_noise_and_as_near_as_they_say_with_it():

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib import Calibration, UnanswerableError, compare, fit
+from calib import Calibration, UnanswerableError, fit
 from calib.calibration.power_curves import basis, curvature, lifted_power
 from calib.data.ranges import without_static
 from calib.estimator import known_distances
-from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
+from tests.calib.synthetic import DELAYS_NS, about_their_mean, bias_m, ranges
 
 
 @pytest.mark.slow
@@ -22,11 +22,9 @@ def test_the_joint_fit_is_better_if_power_depends_on_the_pair():
     fpp = [np.where(low, power - 6, power) for power in (r.fpp1_dbm, r.fpp2_dbm)]
     before, after = (lifted_power(one, two, "mean-of-lifted", -82.0) for one, two in ((r.fpp1_dbm, r.fpp2_dbm), fpp))
     r = replace(r, fpp1_dbm=fpp[0], fpp2_dbm=fpp[1], raw_m=r.raw_m + slope * (after - before))
-    wrong = {}
-    for sequential in (False, True):
-        c = fit(r, sequential=sequential).calibration
-        wrong[sequential] = np.std(np.array([c.delays_ns[tag] - d for tag, d in DELAYS_NS.items()]))
-    assert wrong[False] < 0.02 < wrong[True]
+    fits = (fit(r, sequential=sequential).calibration for sequential in (False, True))
+    together, after = (np.std(about_their_mean(found, DELAYS_NS)[0]) for found in fits)
+    assert together < 0.02 < after
 
 
 def grouped(r, groups):
@@ -50,20 +48,6 @@ def test_groups_of_tags_get_their_own_curves():
     assert np.median(np.abs(np.median(applied.corrected_m - r.truth_m))) < 0.02
     mixed = np.isin(r.initiator, (1, 2)) != np.isin(r.target, (1, 2))
     assert np.std((applied.delay_corrected_m - applied.corrected_m)[mixed]) < 0.006
-
-
-def test_a_single_pair_gets_the_smallest_delays():
-    r = ranges(3000)
-    c = fit(r[(r.initiator == 1) & (r.target == 2)]).calibration
-    assert all(np.isinf(std) for std in c.delays_std_ns.values())
-    # With the smallest delays, both get the same share of the sum (K is one to a part in 10^5).
-    assert c.delays_ns[1] == pytest.approx(c.delays_ns[2], abs=1e-5)
-    assert Calibration.from_json(c.to_json()) == c
-    assert '"1": null' in c.to_json()
-    # Two delays minus a common shift and the split: only the ranges of the pair can be compared.
-    found = compare(fit(r).calibration, c)
-    assert (found.verdict, found.degrees) == ("unknown", 0)
-    assert abs(found.offset_m) < 0.02
 
 
 @pytest.mark.parametrize("settings", [{}, {"fixed_ns": {1: -0.3}}, {"constants": "pair"}])

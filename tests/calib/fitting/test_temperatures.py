@@ -1,6 +1,7 @@
 """Ranges that grow with the temperature of their ends: found, corrected and refused, in flights of NumPy alone."""
 
 import json
+import re
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -274,25 +275,25 @@ def test_temperatures_of_rows_that_are_messages_are_named_as_not_read(tmp_path):
     assert "temperatures are only read if a row is an exchange" in said
 
 
-@pytest.mark.parametrize(("tag", "later_s"), [(99, 0), (1, 3600)])
-def test_readings_that_are_of_no_range_are_named(tag, later_s):
+@pytest.mark.parametrize(
+    ("tag", "later_s", "celsius", "said"),
+    [
+        (99, 0, 25.0, ["memory: no temperatures .* not used"]),
+        (1, 3600, 25.0, ["memory: no temperatures .* not used"]),
+        (1, 0, 46.0, []),
+        (1, 0, 72.0, ["Fahrenheit"]),
+    ],
+)
+def test_readings_of_no_range_and_degrees_fahrenheit_have_a_warning(tag, later_s, celsius, said):
     flight = calib.sample_flight()
-    readings = {"time_ns": flight.exchanges.time_ns + later_s * 10**9, "tag": np.full(len(flight.exchanges), tag)}
-    readings |= {name: np.full(len(flight.exchanges), 25.0) for name in ("temperature_c", "supply_v")}
-    with pytest.warns(TemperatureWarning, match="memory: no temperatures .* not used"):
-        calib.load_ranges(replace(flight, temperature=readings))
-
-
-@pytest.mark.parametrize(("celsius", "warned"), [(46.0, False), (72.0, True)])
-def test_degrees_fahrenheit_have_a_warning(celsius, warned):
-    flight = calib.sample_flight()
-    count = len(flight.exchanges)
-    readings = {"time_ns": flight.exchanges.time_ns, "tag": np.full(count, 1), "supply_v": np.full(count, np.nan)}
+    time_ns, count = flight.exchanges.time_ns, len(flight.exchanges)
+    readings = {"time_ns": time_ns + later_s * 10**9, "tag": np.full(count, tag), "supply_v": np.full(count, np.nan)}
     readings["temperature_c"] = np.linspace(celsius - 10, celsius + 10, count)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         calib.load_ranges(replace(flight, temperature=readings))
-    assert ["Fahrenheit" in str(one.message) for one in caught] == [True] * warned
+    assert [one.category for one in caught] == [TemperatureWarning] * len(said)
+    assert all(re.search(pattern, str(one.message)) for pattern, one in zip(said, caught, strict=True))
 
 
 def test_exact_ranges_of_a_data_frame_with_hot_boards_fit_and_warn_at_the_line_of_the_caller():

@@ -3,7 +3,6 @@
 import io
 import json
 import re
-import shutil
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -11,15 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from pypdf import PdfReader
-from typer.testing import CliRunner
 
 import calib
-from calib.cli.commands import app
 from calib.report import Heading, Picture, Table, Text, check_places
 from calib.report.figures import arrangement
 from calib.report.sections import SECTIONS
-from tests import pages, processes
-from tests.calib.report.test_report import fonts_of
+from tests import pages
+from tests.processes import refuse, succeed
 from uwblink import Contents, Recording, UwblinkError
 from uwblink.pages import figures
 from uwblink.pages.blocks import Document, write_document
@@ -38,12 +35,6 @@ def folder(tmp_path_factory):
         Contents(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags).save(folder / f"{name}.uwb")
         calib.fit(flight, loss="huber").calibration.save(folder / f"{name}.json")
     return folder
-
-
-def run(folder, *words, status=0):
-    done = processes.run("calib", *words, cwd=folder)
-    assert done.returncode == status, done.stderr
-    return done
 
 
 @pytest.fixture
@@ -77,10 +68,8 @@ def test_a_campaign_is_what_the_command_makes(folder, tmp_path, monkeypatch, sec
     shares = [one for one in told if not isinstance(one, str)]
     assert (shares, shares[0], sum(share >= 0.65 for share in shares)) == (sorted(set(shares)), 0.0, 1)
     assert [one for one in told if isinstance(one, str)][4:] == ["drawing delays", "writing the page"]
-    monkeypatch.chdir(folder)
-    words = "report a.uwb --tests b.uwb -o command.html --loss huber --json --figures drawn"
-    done = CliRunner().invoke(app, words.split(), catch_exceptions=False)
-    assert json.loads(done.stdout) == json.loads(json.dumps(campaign.to_dict()))
+    words = "calib report a.uwb --tests b.uwb -o command.html --loss huber --json --figures drawn"
+    assert json.loads(succeed(*words.split(), cwd=folder).stdout) == json.loads(json.dumps(campaign.to_dict()))
     assert {path.name for path in (folder / "drawn").iterdir()} == {f"delays-{form}" for form in FORMS}
     made = [(tmp_path / "python.html").read_text(), (folder / "command.html").read_text()]
     # Time, command and files differ.
@@ -145,6 +134,16 @@ def weather(campaign):
     return [Heading("Weather"), Text(f"Dry over {len(campaign.judged)} ranges; <wet> tomorrow.")]
 
 
+def fonts_of(resources):
+    """Yield the kind of every font in some resources, forms included."""
+    for font in (resources.get("/Font") or {}).values():
+        for one in [font.get_object(), *(d.get_object() for d in font.get_object().get("/DescendantFonts", []))]:
+            yield one["/Subtype"]
+    for form in (one.get_object() for one in (resources.get("/XObject") or {}).values()):
+        if form["/Subtype"] == "/Form" and "/Resources" in form:
+            yield from fonts_of(form["/Resources"].get_object())
+
+
 def test_registered_sections_are_in_the_report(campaign, tmp_path, sections):
     sections |= {"delays": SECTIONS["delays"]}
     calib.register_report_section("weather", weather, before="determined")
@@ -157,12 +156,30 @@ def test_registered_sections_are_in_the_report(campaign, tmp_path, sections):
     outline: list[Any] = printed.outline
     begin = {item["/Title"]: printed.get_destination_page_number(item) for item in outline}
     assert list(begin) == titles
-    texts = [one.extract_text() for one in printed.pages]
+    sizes: set[float] = set()
+
+    def seen(text, cm, tm, font, size):
+        if text.strip():
+            sizes.add(size * abs(tm[3] or tm[1]) * abs(cm[3] or cm[1]))
+
+    texts = [one.extract_text(visitor_text=seen) for one in printed.pages]
+    assert min(sizes) >= 7.99, "no text is smaller than 8 pt"
     assert all(name in texts[place] for name, place in begin.items())
     assert all(f"{number} / {len(texts)}" in text for number, text in enumerate(texts, 1))
     assert any("antenna delay (ns)" in text for text in texts), "the words inside a figure are words"
-    kinds = {kind for one in printed.pages for kind in fonts_of(one["/Resources"], set())}
+    numbered = re.findall(r"Figure (\d+)\.", "\n".join(texts))
+    assert [int(number) for number in numbered] == list(range(1, len(numbered) + 1))
+    # Outlines that printers accept: type 42; publishers refuse type 3.
+    kinds = {kind for one in printed.pages for kind in fonts_of(one["/Resources"])}
     assert kinds <= {"/Type0", "/CIDFontType2", "/TrueType"}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("sections")
+def test_the_command_writes_a_pdf(folder, tmp_path):
+    words = ("calib", "report", folder / "a.uwb", "--loss", "huber", "-o", tmp_path / "r.html")
+    succeed(*words, "--pdf", tmp_path / "r.pdf")
+    assert "Provenance" in "".join(page.extract_text() for page in PdfReader(tmp_path / "r.pdf").pages)
 
 
 @pytest.mark.parametrize(
@@ -197,27 +214,24 @@ def test_a_section_that_returns_no_blocks_is_named(campaign, tmp_path, blocks, s
         (["evaluate", "a.uwb", "-c", "b.json"], {"delays"}),
     ],
 )
-def test_commands_draw_results_and_replace_no_files(folder, words, names, sections, monkeypatch):
+def test_commands_draw_results_and_replace_no_files(folder, tmp_path, words, names, sections, monkeypatch):
     # Figures of a report are rendered in test_report.py.
     monkeypatch.setattr(figures, "drawn", pages.outline)
-    shutil.rmtree(folder / "out", ignore_errors=True)
-    command = CliRunner().invoke
-    words = [str(folder / word) if "." in word else word for word in words] + ["--figures", str(folder / "out")]
     sections |= {"delays": SECTIONS["delays"]}
-    done = command(app, words, catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    assert {f"{name}-{form}" for name in names for form in FORMS} <= {path.name for path in (folder / "out").iterdir()}
-    with pytest.raises(calib.BadInputError, match="out already contains figures"):
-        command(app, words, catch_exceptions=False)
+    command = ("calib", *words, "--figures", tmp_path / "out")
+    succeed(*command, cwd=folder)
+    made = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {f"{name}-{form}" for name in names for form in FORMS} <= made
+    refuse(*command, cwd=folder, naming=["out already contains figures"])
 
 
 def test_reports_do_not_replace_files(folder, tmp_path):
-    done = run(folder, "report", "a.uwb", "-o", "same.pdf", "--pdf", "same.pdf", "--loss", "huber", status=2)
-    assert "same.pdf" in done.stderr
-    assert not (folder / "same.pdf").exists()
-    done = run(folder, "report", "a.uwb", "-o", "report.txt", "--loss", "huber", status=2)
-    assert "report.txt: found .txt, expected .html or .htm or .pdf" in done.stderr
-    assert not (folder / "report.txt").exists()
+    for named, *more in (
+        ("same.pdf", "-o", "same.pdf", "--pdf", "same.pdf"),
+        ("report.txt: found .txt, expected .html or .htm or .pdf", "-o", "report.txt"),
+    ):
+        refuse("calib", "report", "a.uwb", *more, "--loss", "huber", cwd=folder, naming=[named])
+        assert not (folder / more[1]).exists()
     with pytest.raises(calib.BadInputError, match=r"a\.pdf"):
         check_places(tmp_path / "a.pdf", tmp_path / "a.pdf", None, force=True)
     pictures = [Picture("same", lambda width: sheet(width)[0], text) for text in ("one", "two")]
@@ -232,8 +246,8 @@ def words_of(svg):
 
 @pytest.mark.slow
 def test_plans_have_a_figure_of_each_arrangement(tmp_path):
-    words = ("plan", "survey", "7,12,3", "--on", "line", "--arrangements", "2", "--taped", "1")
-    run(tmp_path, *words, "-o", "plan.html", "--figures", "f")
+    words = ("calib", "plan", "survey", "7,12,3", "--on", "line", "--arrangements", 2, "--taped", 1, "-o", "plan.html")
+    succeed(*words, "--figures", "f", cwd=tmp_path)
     page, files = (tmp_path / "plan.html").read_text(), {path.name for path in (tmp_path / "f").iterdir()}
     assert files == {f"{name}-{form}" for name in ("arrangement-A", "arrangement-B", "more") for form in FORMS}
     drawn = [words_of((tmp_path / "f" / f"arrangement-{name}-page.svg").read_text()) for name in "AB"]
@@ -244,7 +258,7 @@ def test_plans_have_a_figure_of_each_arrangement(tmp_path):
     assert {"Step 2: arrangement B", "before it"} <= set(drawn[1])
     assert "Step 2: arrangement B" in page
     assert "calib survey A.uwb B.uwb --known known.toml" in page
-    assert "plan.html" in run(tmp_path, *words, "-o", "plan.html", status=2).stderr
+    refuse(*words, cwd=tmp_path, naming=["plan.html"])
     assert (tmp_path / "plan.html").read_text() == page
     in_space = words_of(
         picture(partial(arrangement, plan=calib.plan(5, on="space", arrangements=1), number=0), "svg").decode()
@@ -255,8 +269,8 @@ def test_plans_have_a_figure_of_each_arrangement(tmp_path):
 
 @pytest.mark.slow
 def test_planned_flights_have_figures_of_path_intervals_and_gains(tmp_path):
-    words = ["plan", "flight", "2", "--duration", "8", "--rate", "40", "--anchor-tags", "11,12,13,14"]
-    run(tmp_path, *words, "--anchors", "sought", "--poses-until", "4", "-o", "plan.html")
+    words = "plan flight 2 --duration 8 --rate 40 --anchor-tags 11,12,13,14 --anchors sought --poses-until 4"
+    succeed("calib", *words.split(), "-o", "plan.html", cwd=tmp_path)
     text = (tmp_path / "plan.html").read_text(encoding="utf-8")
     assert {"anchor12", "stays open", "+ measured positions of the anchors"} <= set(words_of(text))
     assert "Fit delays, curve and trajectories together." in text

@@ -3,12 +3,10 @@
 import hashlib
 import json
 import re
-from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from pypdf import PdfReader
 
 from calib.cli.judging import spread_tests
 from calib.fitting.fitting import fit
@@ -72,46 +70,6 @@ def test_all_figures_have_paper_size(campaign):
 
 def sizes_of_drawing(text):
     return {float(size) for size in re.findall(r"font(?:-size)?: ([0-9.]+)px", text)}
-
-
-def fonts_of(resources, seen):
-    """Yield the kind of every font in some resources, forms included."""
-    for font in (resources.get("/Font") or {}).values():
-        for one in [font.get_object(), *(d.get_object() for d in font.get_object().get("/DescendantFonts", []))]:
-            yield one["/Subtype"]
-    for form in (resources.get("/XObject") or {}).values():
-        form = form.get_object()
-        if form["/Subtype"] == "/Form" and id(form) not in seen and "/Resources" in form:
-            seen.add(id(form))
-            yield from fonts_of(form["/Resources"].get_object(), seen)
-
-
-@pytest.mark.slow
-def test_the_pdf_has_numbered_pages_an_outline_and_figures_that_are_drawings(campaign):
-    run("calib", "report", "train.uwb", "--tests", f"{TEST}.uwb", "-o", "p.html", "--pdf", "r.pdf", cwd=campaign)
-    reader = PdfReader(campaign / "r.pdf")
-    assert 5 <= len(reader.pages) <= 20
-    texts, sizes, kinds = [], set(), set()
-
-    def seen(text, cm, tm, font, size):
-        if text.strip():
-            sizes.add(round(size * abs(tm[3] or tm[1]) * abs(cm[3] or cm[1]), 2))
-
-    for number, page in enumerate(reader.pages, 1):
-        texts.append(page.extract_text(visitor_text=seen))
-        kinds |= set(fonts_of(page["/Resources"], set()))
-        assert f"{number} / {len(reader.pages)}" in texts[-1]
-    assert min(sizes) >= 7.99, "no text is smaller than 8 pt"
-    # Outlines that printers accept: type 42; publishers refuse type 3.
-    assert kinds <= {"/Type0", "/CIDFontType2", "/TrueType"}
-    whole = "\n".join(texts)
-    assert "lifted power" in whole, "the words inside a figure are words"
-    figures = re.findall(r"Figure (\d+)\.", whole)
-    assert [int(number) for number in figures] == list(range(1, len(figures) + 1))
-    outline: list[Any] = reader.outline
-    begin = {item["/Title"]: reader.get_destination_page_number(item) for item in outline}
-    assert {"Localization", "Over time", "Provenance"} <= set(begin)
-    assert all(name in texts[place] for name, place in begin.items())
 
 
 def test_the_json_contains_the_results_of_the_page(campaign):

@@ -39,6 +39,36 @@ def in_order(*orders):
 FOUR = in_order((1, 2, 3, 4), (2, 1, 4, 3), (3, 1, 4, 2), (2, 4, 1, 3), (4, 3, 2, 1), (1, 3, 4, 2), (3, 2, 4, 1))
 
 
+def spans(count):
+    """Return the time of each arrangement of a world, by its number from 1."""
+    return {str(k + 1): (70.0 * k, 70.0 * k + 60) for k in range(count)}
+
+
+def moved(by_m, arrangements, **settings):
+    """Return a world in which board 4 is moved during the third arrangement."""
+    world = standing_boards(9, places=FOUR[:arrangements], pair_error_m=0.01, **settings)
+    r, place = world.ranges, world.places[2][:, 0]
+    late = (r.time_ns > 2 * 70e9 + 25e9) & (r.time_ns < 3 * 70e9 - 5e9) & ((r.initiator == 4) | (r.target == 4))
+    away = place[3] - place[r.initiator + r.target - 5]
+    return replace(world, ranges=replace(r, raw_m=r.raw_m + late * (np.abs(away + by_m) - np.abs(away))))
+
+
+def crooked():
+    places = [p.copy() for p in FOUR[:5]]
+    places[2][3, 1] = 1.2
+    return standing_boards(9, places=places, pair_error_m=0.01, bias_size_m=0.02)
+
+
+def saved(world, path, known="line", distances=(), power_dbm=None):
+    """Write a world as a recording of double-sided exchanges, with its arrangements A, B and on."""
+    r, power = world.ranges, world.ranges.fpp1_dbm if power_dbm is None else np.full(len(world.ranges), power_dbm)
+    x = stamped(r.time_ns, np.column_stack([r.initiator, r.target]), r.raw_m, np.stack([power, power]))
+    at_ns = np.arange(len(world.places)) * 70 * 10**9
+    marks = [Arrangement("ABCDEFGH"[k], ns, ns + 65 * 10**9, known) for k, ns in enumerate(at_ns.tolist())]
+    Contents(exchanges=x, arrangements=marks, known_distances=list(distances)).save(path)
+    return path
+
+
 def scores(result, planted):
     found = result.calibration
     return {t: (d - planted[t]) / found.delays_std_ns[t] for t, d in found.delays_ns.items()}
@@ -109,13 +139,15 @@ def test_three_boards_in_a_row_determine_only_the_middle_delay():
     assert max(map(abs, scores(result, world.delays_ns).values())) < 3
 
 
-def test_one_arrangement_in_space_determines_nothing_and_names_the_boards():
+def test_one_arrangement_in_space_determines_nothing_and_names_the_boards(tmp_path):
     world = standing_boards(5, "space", boards=5, arrangements=1)
     with pytest.raises(
         calib.UnanswerableError, match=r"determine no delay: .* can change .*`calib plan survey`"
     ) as caught:
         calib.survey(world.ranges)
     assert caught.value.undetermined == [[1, 2, 3, 4, 5]]
+    found = calib.examine(saved(world, tmp_path / "a.uwb", known=""))
+    assert "survey determines nothing" in [one.fault for one in found]
 
 
 @pytest.mark.slow
@@ -160,9 +192,8 @@ def test_the_general_shape_applies_to_arrangements_without_one(tmp_path):
 def test_one_pair_determines_no_delay(shape):
     ranges = standing_boards(1, boards=2, arrangements=4).ranges
     for count in (1, 4):
-        spans = {str(k): (70.0 * k, 70.0 * k + 60) for k in range(count)}
         with pytest.raises(calib.UnanswerableError, match="determine no delay"):
-            calib.survey(ranges, known=calib.Knowledge(shape=shape, spans_s=spans))
+            calib.survey(ranges, known=calib.Knowledge(shape=shape, spans_s=spans(count)))
 
 
 def test_files_of_known_facts_are_read(tmp_path):
@@ -186,22 +217,17 @@ def test_files_of_known_facts_are_read(tmp_path):
 def test_a_distance_for_all_arrangements_is_one_measurement():
     world = standing_boards(5, boards=3, places=in_order(*[(1, 2, 3)] * 4), pair_error_m=0.002)
     taped = tuple(KnownDistance(i, i + 1, d, 0.02) for i, d in ((1, 0.9), (2, 1.2)))
-    spans = {str(k): (70.0 * k, 70.0 * k + 60) for k in range(4)}
-    found = calib.survey(world.ranges, known=calib.Knowledge(shape="line", spans_s=spans, distances=taped)).calibration
+    known = calib.Knowledge(shape="line", spans_s=spans(4), distances=taped)
+    found = calib.survey(world.ranges, known=known).calibration
     # r12 determines delays 1 and 2 together to 2 cm, 0.13 ns; delay 2 is that of the middle board.
     assert found.delays_std_ns[1] == pytest.approx(2 * 0.02 / 0.2997, rel=0.25)
 
 
 def test_a_position_for_all_arrangements_is_one_measurement():
     world = standing_boards(5, "plane", boards=3, places=[standing_boards(5, "plane", boards=3).places[0]] * 4)
-    at = {t: tuple(place.tolist()) for t, place in enumerate(world.places[0], start=1)}
-    stds = []
-    for count in (1, 4):
-        spans = {str(k): (70.0 * k, 70.0 * k + 60) for k in range(count)}
-        known = calib.Knowledge(
-            shape="plane", spans_s=spans, positions=tuple(calib.KnownPosition(t, p, 0.02) for t, p in at.items())
-        )
-        stds.append(calib.survey(world.ranges, known=known, pair_error_m=1e-4).verdict.std[0])
+    at = tuple(calib.KnownPosition(tag, tuple(place.tolist()), 0.02) for tag, place in enumerate(world.places[0], 1))
+    known = [calib.Knowledge(shape="plane", spans_s=spans(count), positions=at) for count in (1, 4)]
+    stds = [calib.survey(world.ranges, known=one, pair_error_m=1e-4).verdict.std[0] for one in known]
     # The same positions four times are not known better.
     assert stds[1] == pytest.approx(stds[0], rel=0.1)
 
@@ -241,67 +267,68 @@ def test_known_positions_give_the_frame_and_mirror_images_are_stated():
         assert np.abs(away).max() < 4 * math.sqrt(np.diag(board.covariance_m2).max())
 
 
-@pytest.mark.parametrize("moved", [0.10, -0.25])
-def test_a_board_that_was_moved_is_named(moved):
-    world = standing_boards(6, places=FOUR[:3], pair_error_m=0.01)
-    r = world.ranges
-    late = (r.time_ns > 2 * 70e9 + 25e9) & (r.time_ns < 3 * 70e9 - 5e9) & ((r.initiator == 4) | (r.target == 4))
-    other = np.where(r.initiator == 4, r.target, r.initiator)
-    place = world.places[2][:, 0]
-    before = np.abs(place[3] - place[other - 1])
-    raw = r.raw_m + np.where(late, np.abs(place[3] + moved - place[other - 1]) - before, 0.0)
-    known = calib.Knowledge(shape="line", spans_s={str(k + 1): (70.0 * k, 70.0 * k + 60) for k in range(3)})
+@pytest.mark.parametrize(("by_m", "chance"), [(0.10, 1e-6), (-0.25, 1e-50)])
+def test_a_board_that_was_moved_is_named(by_m, chance):
+    ranges, known = moved(by_m, 3).ranges, calib.Knowledge(shape="line", spans_s=spans(3))
     with pytest.raises(calib.UnanswerableError, match=r"^3: board 4 was moved 2\d s after the start"):
-        calib.survey(replace(r, raw_m=raw), known=known)
-    (found,) = calib.survey(replace(r, raw_m=raw), known=known, regardless=True).contradictions
+        calib.survey(ranges, known=known)
+    (found,) = calib.survey(ranges, known=known, regardless=True).contradictions
     # Steps of single pairs exceed six standard deviations, and a longer step is less likely by chance.
     assert found.fault == "board moved within an arrangement"
     assert found.p_value is not None
-    assert 0 < found.p_value < (1e-6 if moved == 0.10 else 1e-50)
+    assert 0 < found.p_value < chance
 
 
-def wrong_labels():
-    """Six boards on a table with four known positions, and the labels of two exchanged."""
-    world = standing_boards(8, "plane", boards=6, arrangements=3, pair_error_m=0.01)
-    names, where = {1: 2, 2: 1}, world.places[0]
-    said = tuple(calib.KnownPosition(names.get(t, t), tuple(where[t - 1].tolist()), 0.01, "1") for t in range(1, 5))
-    return world, calib.Knowledge(shape="plane", positions=said), "exchanged labels", "if 1 and 2 are exchanged"
-
-
-def wrong_tape():
-    """A measured distance that is 30 cm off, and one that is right."""
-    said = (KnownDistance(1, 3, 2.1 + 0.3, 0.005, "1"), KnownDistance(2, 4, 2.7, 0.005, "1"))
-    world, text = (
-        standing_boards(9, places=FOUR[:5], pair_error_m=0.01),
-        r"the known distance of 1 and 3 in 1 differs from the ranges by \+\d+ cm",
-    )
-    return world, calib.Knowledge(shape="line", distances=said), "wrong known distance", text
-
-
-def crooked_line():
-    places = [p.copy() for p in FOUR[:5]]
-    places[2][3, 1] = 0.8
-    return (
-        standing_boards(2, places=places, pair_error_m=0.01),
-        "line",
-        "arrangement not as stated",
-        "^3: the boards are not on a line",
-    )
+STRAIGHT = standing_boards(9, places=FOUR[:5], pair_error_m=0.01, bias_size_m=0.02)
+TAPES = KnownDistance(1, 3, 2.1 + 0.3, 0.005, "A"), KnownDistance(2, 4, 2.7, 0.005, "A")
+"""A measured distance that is 30 cm off, and one that is right."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mistake", [wrong_labels, wrong_tape, crooked_line])
-def test_wrong_known_facts_are_named(mistake):
-    world, known, kind, message = mistake()
-    result = calib.survey(world.ranges, known=known, regardless=True)
-    assert [one.fault for one in result.contradictions] == [kind]
-    assert re.search(message, result.contradictions[0].evidence)
-    chance = result.contradictions[0].p_value
-    assert chance is not None
-    assert 0 <= chance < 0.01
+@pytest.mark.parametrize(
+    ("world", "tapes", "expected"),
+    [
+        (STRAIGHT, (), []),
+        (STRAIGHT, TAPES, [
+            ("wrong known distance", r"the known distance of 1 and 3 in A differs from the ranges by \+\d+ cm"),
+        ]),
+        (crooked(), (), [("arrangement not as stated", "C: the boards are not on a line")]),
+        (moved(0.2, 5, bias_size_m=0.02), (), [("board moved within an arrangement", r"C: board 4 was moved 2\d s")]),
+    ],
+    ids=["sound", "a wrong tape", "crooked", "moved"],
+)  # fmt: skip
+def test_contradictions_are_named_by_a_survey_and_by_the_doctor(tmp_path, world, tapes, expected):
+    path = saved(world, tmp_path / "a.uwb", distances=tapes)
+    result = calib.survey(path, regardless=True)
+    for found in (result.contradictions, calib.examine(path)):
+        assert [one.fault for one in found] == [fault for fault, _ in expected]
+        for one, (_, evidence) in zip(found, expected, strict=True):
+            assert re.match(evidence, one.evidence)
+            assert one.p_value is not None
+            assert 0 <= one.p_value < 0.01
     assert max(map(abs, scores(result, world.delays_ns).values())) < 4
-    if kind == "arrangement not as stated":
-        assert [one.known for one in result.arrangements] == ["line", "line", "plane", "line", "line"]
+    shapes = ["line" if k != 2 or world.places[2][3, 1] == 0 else "plane" for k in range(len(world.places))]
+    assert [one.known for one in result.arrangements] == shapes
+
+
+@pytest.mark.slow
+def test_exchanged_labels_of_known_positions_are_named():
+    """Six boards on a table with four known positions, and the labels of two exchanged."""
+    world = standing_boards(8, "plane", boards=6, arrangements=3, pair_error_m=0.01)
+    places = dict(zip((2, 1, 3, 4), world.places[0].tolist(), strict=False))
+    said = tuple(calib.KnownPosition(tag, tuple(place), 0.01, "1") for tag, place in places.items())
+    result = calib.survey(world.ranges, known=calib.Knowledge(shape="plane", positions=said), regardless=True)
+    (found,) = result.contradictions
+    assert (found.fault, "if 1 and 2 are exchanged" in found.evidence) == ("exchanged labels", True)
+    assert found.p_value is not None
+    assert 0 <= found.p_value < 0.01
+    assert max(map(abs, scores(result, world.delays_ns).values())) < 4
+
+
+@pytest.mark.slow
+def test_powers_that_hardly_vary_are_named_by_the_doctor(tmp_path):
+    path = saved(standing_boards(9, places=FOUR[:3], pair_error_m=0.01), tmp_path / "a.uwb", power_dbm=-80.0)
+    assert [one.fault for one in calib.examine(path)] == ["powers that hardly vary"]
 
 
 def test_correct_known_facts_have_no_finding():
@@ -464,8 +491,7 @@ def test_a_curve_is_used_if_powers_do_not_vary():
             (k, i, j): np.linalg.norm(p[i] - p[j]) for k, p in enumerate(places) for i in range(4) for j in range(i)
         }
         lengths = (KnownDistance(j + 1, i + 1, float(d), 0.003, str(k + 1)) for (k, i, j), d in apart.items())
-        spans = {str(k + 1): (70.0 * k, 70.0 * k + 60.0) for k in range(len(places))}
-        return calib.Knowledge(spans_s=spans, distances=tuple(lengths))
+        return calib.Knowledge(spans_s=spans(len(places)), distances=tuple(lengths))
 
     def world(places):
         return standing_boards(8, boards=4, places=places, bias_size_m=0.1, pair_error_m=0.005)
