@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes as Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
 from scipy.stats import norm
 
 from calib.calibration.applying import CorrectedRanges
@@ -258,7 +259,7 @@ def within_fence(values: Floats) -> Any:
     return away <= (12.0 * usual if usual > 0 else np.inf)
 
 
-def limit_without_outliers(axes: Axes, values: Floats, shown: Floats | tuple[()] = ()) -> None:
+def limit_without_outliers(axes: Axes, values: Floats, shown: ArrayLike = ()) -> None:
     """Set the limits of the vertical axis to values (n,) without outliers, and to the values `shown` (k,)."""
     inside = np.append(values[within_fence(values)], shown)
     margin = 0.12 * float(np.ptp(inside)) + 1e-9

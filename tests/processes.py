@@ -50,7 +50,9 @@ def run(*words: object, cwd: str | os.PathLike[str] | None = None, **how: Any) -
     out, err = io.StringIO(), io.StringIO()
     printed = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
     caught = warnings.catch_warnings(action="default")
-    with contextlib.chdir(cwd or Path.cwd()), printed[0], printed[1], caught, mock.patch.object(sys, "argv", argv):
+    # The module that runs the tests would give the command its name (`python -m pytest`).
+    named = mock.patch.object(sys, "argv", argv), mock.patch.object(sys.modules["__main__"], "__package__", None)
+    with contextlib.chdir(cwd or Path.cwd()), printed[0], printed[1], caught, named[0], named[1]:
         try:
             importlib.import_module(f"{argv[0]}.cli").main()
         except SystemExit as end:

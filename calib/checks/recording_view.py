@@ -34,7 +34,7 @@ from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.recording.summary import differences, repeated_rows, single_reports
-from uwblink.twr import Exchanges, range_ns
+from uwblink.twr import Exchanges
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,20 +98,20 @@ def view_of(name: str, source: Source) -> RecordingView:
     both = part.exchanges[~again]
     reports = single_reports(both)
     e = reports.exchanges
-    truth_m, posed = e.truth_m, False
+    with np.errstate(all="ignore"):
+        ranges = Ranges.from_exchanges(e)
+    truth_m, posed = ranges.truth_m, False
     if len(part.poses):
-        by_poses = distances_m(part.poses, part.tags, e.initiator, e.target, range_ns(e))
+        by_poses = distances_m(part.poses, part.tags, e.initiator, e.target, ranges.valid_ns)
         given = np.isfinite(truth_m)
         # Tables with places of antennas have both, which are then equal.
         apart = np.abs(truth_m - by_poses)[given & np.isfinite(by_poses)]
         posed = not given.any() or (len(apart) > 0 and float(np.median(apart)) < 0.001)
         truth_m = by_poses if posed else truth_m
-    with np.errstate(all="ignore"):
-        ranges = Ranges.from_exchanges(e, truth_m)
     return RecordingView(
         name=name,
         exchanges=e,
-        ranges=ranges,
+        ranges=replace(ranges, truth_m=truth_m),
         poses=part.poses,
         tags=list(part.tags),
         faults=list(getattr(part, "faults", ())),

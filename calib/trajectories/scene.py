@@ -133,7 +133,7 @@ def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True)
     for tag, (body, arm) in arms.items():
         if body in still and len(turned[body]):
             arms[tag] = body, Rotation.from_quat(turned[body].quaternion[0]).apply(arm)
-    last = float(_seconds(ranges.valid_ns[-1:], began)[0])
+    last = float(_seconds(ranges.valid_ns, began)[-1])
     until = last if settings.poses_until_s is None else min(settings.poses_until_s, last)
     sensed = {body: Readings.of(imu, body, began) for body in moving}
     found = {body: _attitude(body, turned[body], began, sensed[body], settings, name) for body in moving}

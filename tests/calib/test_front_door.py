@@ -9,6 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import calib
+from calib.calibration.power_curves import Curve
 from calib.estimator.losses import LOSSES
 from calib.figures import binned, cumulative, curve_over_power, delays, histogram, within_fence
 from calib.report.sections import SECTIONS
@@ -135,6 +136,16 @@ def test_curves_with_few_points_are_drawn_completely(fitted):
     axes = axes_of(lambda a: curve_over_power(faint, known.apply(faint), known, "bias", a))
     (low, high), drawn = axes.get_ylim(), labelled(axes, "fitted").get_ydata()
     assert low < drawn.min() < drawn.max() < high
+
+
+def test_a_curve_is_drawn_where_the_ranges_are_if_it_is_flat_elsewhere(fitted):
+    known = fitted.calibration
+    steep = Curve((0.0,) * 4 + (0.5, 1.0) + (15.0,) * 4, (-0.2, -0.18, 0.04, 0.04, 0.04, 0.04), 3, (0.0, 15.0))
+    faint = fitted.ranges[fitted.ranges.fpp1_dbm < np.quantile(fitted.ranges.fpp1_dbm, 0.3)]
+    changed = replace(known, bias_curve=steep, uncertainty=None)
+    low, high = axes_of(lambda a: curve_over_power(faint, changed.apply(faint), changed, "bias", a)).get_ylim()
+    of_ranges = 100 * steep(changed.lifted(faint))
+    assert np.mean((of_ranges > low) & (of_ranges < high)) > 0.9
 
 
 def test_the_sigma_curve_goes_through_its_points(fitted):
