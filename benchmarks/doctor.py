@@ -294,6 +294,12 @@ def in_unit(flight: Flight, rng: np.random.Generator) -> Flight:
     return replace(flight, poses=replace(flight.poses, position_m=flight.poses.position_m * many))
 
 
+def scaled(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Make positions 2 to 6 % too large or too small."""
+    size = 1 + float(rng.choice([-1, 1]) * rng.uniform(0.02, 0.06))
+    return replace(flight, poses=replace(flight.poses, position_m=flight.poses.position_m * size))
+
+
 def arms_in_mm(flight: Flight, rng: np.random.Generator) -> Flight:
     """Write lever arms in mm."""
     return arms(flight, lambda tag: tuple(1000 * v for v in tag.lever_arm_m))
@@ -439,6 +445,8 @@ FAULTS: Final = (
     Case("a clock set back", Plan(bits=40), clock_set_back, names("recordings mixed by their times")),
     Case("`rx2` rounded to 10⁷", BASE, lambda f, _: changed(f, rx2=f.exchanges.rx2 // 10**7 * 10**7),
          names("impossible stamps")),
+    Case("positions 2 to 6 % too large or too small", BASE, scaled, names("scale of true distances")),
+    Case("the same, one robot among anchors", RIG, scaled, names("scale of true distances"), names("too few pairs")),
     Case("poses 0.15 to 1.5 s off", BASE, late_poses, names("pose time offset")),
     Case("true distances 0.15 to 0.6 s off, without poses", BASE,
          lambda f, rng: late_truths(f, int(rng.choice([-1, 1]) * rng.uniform(0.15, 0.6) * 1e9)),

@@ -74,6 +74,7 @@ REMEDIES: Final = {
     "undetermined pattern over direction": "record a flight in which the robot makes a full turn at several places",
     "undetermined slope over temperature": "record while the boards warm up",
     "pattern or effect of power": "compare with a fit with `pattern` none and `groups` of tags",
+    "pattern or wrong lever arm": "measure this lever arm again, or run `calib doctor`",
     "pattern of another tag": "fit all recordings together to estimate it",
     "constants of pairs": "record three or more tags that all range with each other for delays",
     "given delays": "fit without `delays_from` to estimate them",

@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.calibration.document import known_of_splits
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
+from calib.checks.fitted import noise_of_readings
 from calib.checks.recording_view import RecordingView
 from calib.data.clocks import uncorrected_skew
 from calib.data.ranges import Ranges
@@ -365,9 +366,8 @@ def missing(view: RecordingView) -> Iterator[Candidate]:
 def confounded(view: RecordingView) -> Iterator[Candidate]:
     """Find power that depends only on distance: then a curve over power cannot be separated from distance.
 
-    The noise of readings is subtracted from the variance of powers: readings of a pair within 0.2 s, in which a robot
-    turns its antenna by a few degrees, differ by noise. The share that groups of distances explain by chance is also
-    subtracted (adjusted share): powers of a pair within 2 s count as nearly one.
+    The noise of readings is subtracted from the variance of powers, and the share that groups of distances explain by
+    chance (adjusted share): powers of a pair within 2 s count as nearly one.
     """
     lifted = lifted_power(view.ranges.fpp1_dbm, view.ranges.fpp2_dbm, "mean-of-lifted", ALPHA_DBM)
     rows = np.flatnonzero(np.isfinite(lifted) & (view.ranges.truth_m > 0))
@@ -377,10 +377,9 @@ def confounded(view: RecordingView) -> Iterator[Candidate]:
     rows = rows[np.lexsort((view.exchanges.time_ns[rows], pairs[rows]))]
     pair, time_ns, shares, groups = pairs[rows], view.exchanges.time_ns[rows], [0.0], 40
     alone = len(np.unique(np.column_stack([pair, time_ns // 2_000_000_000]), axis=0))
-    together = (np.diff(pair) == 0) & (np.diff(time_ns) < 200_000_000)
     # Lifted powers are dominated by short distances, decibels are not. Either share can be too large.
     for power in (lifted[rows], np.log(lifted[rows])):
-        noise = float(np.mean(np.diff(power)[together] ** 2)) / 2 if np.count_nonzero(together) >= 100 else 0.0
+        noise = noise_of_readings(power, pair, time_ns)
         parts = np.array_split(power[np.argsort(view.ranges.truth_m[rows], kind="stable")], groups)
         within, between = float(np.mean([np.var(one) for one in parts])), float(np.var([np.mean(one) for one in parts]))
         if between > within:

@@ -195,6 +195,16 @@ CHECKS: Final = (
     ),
     Check(
         "geometry",
+        "Do errors grow with the true distances by more than 0.5 %?",
+        "slope of errors over true distances; reflections of far ranges may cause a part of it", OVER_BLOCKS,
+        {
+            "scale of true distances": "check the calibration of motion capture or the tape, and the unit; measure one "
+            "long distance again"
+        },
+        geometry.scale,
+    ),
+    Check(
+        "geometry",
         "Do errors spread twice as widely while the poses of a body repeat?",
         "log of the ratio of spreads while poses repeat for 0.5 s and at other times", OVER_STRETCHES,
         {"frozen poses": "motion capture lost the body: delete the poses that repeat the one before, and add the poses "

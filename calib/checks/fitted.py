@@ -21,10 +21,12 @@ from calib.estimator.inverse import positive_part
 from calib.estimator.known_distances import RangeFit
 from calib.estimator.range_model import METRES_A_NS, TYPICAL_OFFSET_M, RangeModel, free_ends
 from calib.estimator.range_rows import Mixture
-from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, search, widening
+from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, Tested, search, widening
+from calib.estimator.score_tests import findings as offsets_of
 from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
 from calib.findings import FIT_LEVELS, NAMED_DETOUR_M, SMALLEST_NS, Finding, combined, warning
+from calib.spread import less_medians
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -66,6 +68,9 @@ def examine_fit(found: RangeFit) -> tuple[Floats, list[Finding]]:
     if found.slopes_of_heard is not None:
         tested += found.slopes_of_heard.tests(list(_of_heard(found)))
     findings = _without_explained(search(tested, FIT_LEVELS["offsets"]))
+    of_truth = list[Finding]()
+    if readings is not None and not any("scale" in one.names for one in findings):
+        of_truth = list(_beyond_noise(found.model, louder, noise, len(tested)))
     plain = found.covariances["delay"]
     for one in tested:
         if one.family.kind in ("pair", "session") and not len(one.family.fitted):
@@ -81,6 +86,7 @@ def examine_fit(found: RangeFit) -> tuple[Floats, list[Finding]]:
     covariance = covariance + positive_part(few_ns2 - (covariance - found.covariances["delay"]))
     return covariance, [
         *named,
+        *of_truth,
         *_reflections(found),
         *_persistence(found),
         *_redundancy(found.model),
@@ -123,10 +129,7 @@ def families(found: RangeFit, louder_m: Floats, *, beside_curve: bool) -> Iterat
         yield of_tags("decibels", louder_m[:, None] / size)
     forth = np.where(ranges.initiator < ranges.target, 1.0, -1.0)
     yield of_tags("skew", forth[:, None] * [1.0, -1.0])
-    speeds, reach = distance_speeds(model), float(np.ptp(ranges.truth_m))
-    shared = {"late": speeds / _root_mean_square(speeds)} if speeds.any() else {}
-    if beside_curve and reach > 0:
-        shared = {"scale": (ranges.truth_m - float(np.median(ranges.truth_m))) / reach} | shared
+    shared = errors_of_truth(model, scale=beside_curve)
     if shared:
         everyone = np.broadcast_to(np.arange(len(shared)), (count, len(shared)))
         values = np.column_stack(list(shared.values()))
@@ -182,6 +185,14 @@ def _of_sessions(found: RangeFit, tags: list[str], ends: Ints) -> Family:
     )
 
 
+def errors_of_truth(model: RangeModel, *, scale: bool = True) -> dict[str, Floats]:
+    """Return the changes of ranges (n,) by true distances of another `scale`, or of another time ("late")."""
+    truth_m, speeds = model.ranges.truth_m, distance_speeds(model)
+    reach = float(np.ptp(truth_m))
+    larger = {"scale": (truth_m - float(np.median(truth_m))) / reach} if scale and reach > 0 else {}
+    return larger | ({"late": speeds / _root_mean_square(speeds)} if speeds.any() else {})
+
+
 def errors_of_readings(model: RangeModel, louder_m: Floats) -> Floats | None:
     """Return the error (n,) by noise of power readings, divided by its root mean square; None if there is none.
 
@@ -192,11 +203,57 @@ def errors_of_readings(model: RangeModel, louder_m: Floats) -> Floats | None:
     """
     if not np.any(louder_m) or not np.ptp(model.ranges.truth_m) > 0:
         return None
+    missing = _beside_readings(model, louder_m)
+    return np.asarray(missing / max(_root_mean_square(missing), 1e-12))
+
+
+def _beside_readings(model: RangeModel, louder_m: Floats) -> Floats:
+    """Return the error (n,) by noise of power readings, divided by the ratio of noise and signal."""
     decibels = 10 * np.log10(np.maximum(model.lifted, 1e-4))
     far = np.log(np.maximum(model.ranges.truth_m, 0.1))
     slope, level = np.polyfit(far, decibels, 1)
-    missing = louder_m * (slope * far + level - decibels)
-    return np.asarray(missing / max(_root_mean_square(missing), 1e-12))
+    return np.asarray(louder_m * (slope * far + level - decibels))
+
+
+def _beyond_noise(model: RangeModel, louder_m: Floats, noise: Tested, tried: int) -> Iterator[Finding]:
+    """Yield a finding if errors beside the readings of power are larger than the noise of readings causes.
+
+    They grow with distance. A scale of true distances has this effect, and so has noise that lasts, which differences
+    of successive readings do not show. Such noise of up to a quarter of the signal is a tolerance: in flights without
+    it (`make sound`), errors beside the readings are those of 0.15 and less.
+    """
+    size_m = _root_mean_square(_beside_readings(model, louder_m))
+    ratio = noise_to_signal(model)
+    for one in offsets_of(noise, tried, FIT_LEVELS["offsets"], (0.25 + ratio) * size_m):
+        # Noise makes ranges longer where powers are higher than expected from the distance.
+        if one.offset_m > 0:
+            evidence = (
+                f"ranges depend on distance beside power as with noise of {one.offset_m / size_m:.1f} times the "
+                f"variance of powers; successive readings show {ratio:.2f}"
+            )
+            causes = ("scale of true distances", "noisy powers")
+            yield combined([warning(causes[0], evidence, one.p_value), warning(causes[1], "the powers are noisy")])
+
+
+def noise_of_readings(power: Floats, pair: Ints, time_ns: Ints) -> float:
+    """Return the variance of the noise of powers (n,), sorted by pair and time; 0 if it cannot be estimated.
+
+    Readings of a pair within 0.2 s, in which a robot turns its antenna by a few degrees, differ by noise.
+    """
+    together = (np.diff(pair) == 0) & (np.diff(time_ns) < 200_000_000)
+    return float(np.mean(np.diff(power)[together] ** 2)) / 2 if np.count_nonzero(together) >= 100 else 0.0
+
+
+def noise_to_signal(model: RangeModel) -> float:
+    """Return the variance of the noise of power readings, divided by the variance of the powers of pairs without noise.
+
+    A curve that is fitted to noisy powers lacks this multiple of itself (attenuation: Carroll et al. 2006, chapter 3).
+    """
+    pair, time_ns = model.pairs.number, model.ranges.time_ns
+    power = less_medians(np.log(np.maximum(model.lifted, 1e-4)), pair)
+    order = np.lexsort((time_ns, pair))
+    noise = noise_of_readings(power[order], pair[order], time_ns[order])
+    return noise / max(float(np.var(power)) - noise, 1e-12)
 
 
 def distance_speeds(model: RangeModel) -> Floats:

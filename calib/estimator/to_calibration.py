@@ -31,9 +31,6 @@ from uwblink.arrays import Floats
 from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
-LEAST_SPREAD_M = 1e-6
-"""Smallest noise: errors without spread have no distribution."""
-
 NODES = 8
 """Number of powers at which noise and share are stated, twice the segments of the curve of noise; both are linear
 between them."""
@@ -84,7 +81,8 @@ def calibration_of(found: RangeFit, delays_ns2: Floats) -> Calibration:
     errors = None
     spread = robust_spread(found.residuals)
     sigmas, sigma_m2 = _flat_sigma(model, spread, 0.5 / len(found.residuals))
-    if LEAST_SPREAD_M < spread < LARGEST_SPREAD_M:
+    # Errors without spread have no distribution.
+    if 1e-6 < spread < LARGEST_SPREAD_M:
         described = described_errors(found)
         errors = error_model(model, found.residuals, described, found.blocks)
         between_m = settings.between_m

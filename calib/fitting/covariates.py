@@ -13,6 +13,8 @@ from scipy.special import chdtri
 
 from calib.calibration.model import Calibration
 from calib.calibration.patterns import HARMONICS, Pattern, TemperatureSlope, harmonics
+from calib.checks.fitted import errors_of_truth
+from calib.checks.geometry import TOLERANCE_M
 from calib.data.ranges import LEAST_TURN_RAD, Ranges, of_host_clock
 from calib.errors import UnanswerableError
 from calib.estimator.covariates import (
@@ -33,7 +35,7 @@ from calib.estimator.time_blocks import Persistence
 from calib.findings import REMEDIES, Finding, warning
 from calib.settings import FitSettings
 from calib.spread import TWO_SIDED_95, robust_spread, students_factor
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
 from uwblink.display import first_few
 
 LOG_EVIDENCE = math.log(100.0)
@@ -120,14 +122,12 @@ def _with(name: str, asked: str, plain: RangeFit, ranges: Ranges) -> tuple[Range
         )
         evidence, marginal = log_evidence(one) + beside, _log_marginal(found.searches[0].optimum)
         if evidence >= LOG_EVIDENCE and marginal > likeliest:
-            explained = name == "pattern" and log_evidence(_beside_power(plain, covariate, kind)) < LOG_EVIDENCE
+            causes = _other_causes(found, covariate, kind) if name == "pattern" else []
+            # Wrong true distances have one unknown or two, and the checks of the fit without a pattern find them.
+            if causes is None:
+                continue
             known = {"kind": mode, "log_evidence": round(evidence, 1)}
-            by_power = warning(
-                "pattern or effect of power",
-                "the pattern over direction may be an effect of power: errors of single tags that depend on power "
-                "explain the data as well",
-            )
-            best, likeliest = (found, known, [by_power] * explained), marginal
+            best, likeliest = (found, known, causes), marginal
         # Slopes of tags are about a common one: what speaks against that speaks against them, too.
         beside = min(evidence, 0.0) * (name == "temperature")
     if best is nothing:
@@ -167,18 +167,56 @@ def _not_fitted(name: str, covariate: Covariate, why: str) -> dict[str, Any]:
     return {"why": why} if name == "temperature" and covariate.tags else {}
 
 
-def _beside_power(plain: RangeFit, covariate: Covariate, kind: str) -> Tested:
-    """Return the slopes of a pattern beside offsets of each tag that go with the rank of power."""
-    names, columns, values = covariate.entries(kind, plain.model.pairs)
-    tags, pairs, count = plain.model.tags, plain.model.pairs, len(values)
-    rank = np.linspace(-1, 1, count)[np.argsort(np.argsort(plain.model.lifted, kind="stable"))]
-    derivative = Derivative(
-        np.concatenate([columns, pairs.among(tags) + len(names)], axis=1),
-        np.concatenate([-values, rank[:, None], rank[:, None]], axis=1),
-        len(names) + len(tags),
-    )
-    tested = plain.slopes.test(Family(kind=kind, names=names, derivative=derivative))
-    return tested.with_fitted(range(len(names), derivative.size)).combined(np.eye(len(names), derivative.size))
+def _other_causes(fitted: RangeFit, covariate: Covariate, kind: str) -> list[Finding] | None:
+    """Return findings about other causes that explain a fitted pattern; None if wrong true distances explain it.
+
+    The causes are the scale or the time of true distances, offsets of each tag that go with the rank of power, and a
+    wrong lever arm of one tag. A cause explains a pattern if there is no decisive evidence for the pattern beside it.
+    """
+    model, count = fitted.model, len(fitted.model.ranges)
+    names, columns, values = covariate.entries(kind, model.pairs)
+    indices = fitted.searches[0].optimum.layout.indices([kind])
+
+    def beside(others: Ints, derivative: Floats) -> Tested:
+        both = np.concatenate([columns, others + len(names)], axis=1), np.concatenate([-values, derivative], axis=1)
+        size = len(names) + int(others.max(initial=-1)) + 1
+        return fitted.slopes.test(Family(kind=kind, names=names, derivative=Derivative(*both, size), fitted=indices))
+
+    def explain(tested: Tested, which: Ints) -> bool:
+        left = tested.with_fitted((len(names) + which).tolist()).combined(np.eye(len(names), len(tested.total)))
+        return log_evidence(left) < LOG_EVIDENCE
+
+    found, shared = list[Finding](), np.array([*errors_of_truth(model).values()]).reshape(-1, count).T
+    which = np.arange(shared.shape[1])
+    if explain(beside(np.broadcast_to(which, shared.shape), shared), which):
+        return None
+    rank = np.linspace(-1, 1, count)[np.argsort(np.argsort(model.lifted, kind="stable"))]
+    by_power = beside(model.pairs.among(model.tags), np.repeat(rank[:, None], 2, axis=1))
+    if explain(by_power, np.arange(len(model.tags))):
+        found.append(
+            warning(
+                "pattern or effect of power",
+                "the pattern over direction may be an effect of power: errors of single tags that depend on power "
+                "explain the data as well",
+            )
+        )
+    # An error of a lever arm has the effect of harmonics of degree 1, the first three of each end.
+    _, own, waves = covariate.entries(OWN, model.pairs)
+    first = np.flatnonzero(np.arange(own.shape[1]) % HARMONICS < 3)
+    by_arm = beside(own[:, first] // HARMONICS * 3 + own[:, first] % HARMONICS, -waves[:, first])
+    for number, tag in enumerate(covariate.tags):
+        which = 3 * number + np.arange(3)
+        mine = len(names) + which
+        size_m = np.linalg.pinv(by_arm.information[np.ix_(mine, mine)], hermitian=True) @ by_arm.total[mine]
+        away_m = math.sqrt(3) * float(np.linalg.norm(size_m))
+        if away_m > 2 * TOLERANCE_M and explain(by_arm, which):
+            found.append(
+                warning(
+                    "pattern or wrong lever arm",
+                    f"tag {tag}: its pattern over direction may be a lever arm that is wrong by {100 * away_m:.0f} cm",
+                )
+            )
+    return found
 
 
 def with_new_tag(calibration: Calibration, tag: int, ranges: Ranges) -> Calibration:

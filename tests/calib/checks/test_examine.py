@@ -124,6 +124,9 @@ UNREAD = "single-sided without carrier readings"
         (BRIEF, poses_times(100), "unit of the poses", 'distance = "cm"'),
         (BRIEF, poses_times(1 / 0.0254), "unit of the poses", 'distance = "in"'),
         (BRIEF, poses_times(1 / 0.3048), "unit of the poses", 'distance = "ft"'),
+        (SHORT, poses_times(1.03), "scale of true distances", r"(2\.[6-9]|3\.[0-4]) % too long"),
+        (SHORT, poses_times(0.97), "scale of true distances", r"(2\.[6-9]|3\.[0-4]) % too short"),
+        (replace(SHORT, share=0.2, lasts_s=1.0), poses_times(0.95), "scale of true distances", "% too short"),
         (BRIEF, partial(bare, many=1000.0), "unit of the ranges", 'distance = "mm"'),
         (BRIEF, partial(bare, many=100.0), "unit of the ranges", 'distance = "cm"'),
         (BRIEF, partial(bare, truth=False), "unit of the ranges", ""),
@@ -186,6 +189,7 @@ def test_only_the_planted_fault_is_named(plan, plant, fault, told):
     [
         (replace(SHORT, protocol="ds-alt"), planted.nothing, []),
         (SHORT, late_truths(10_000_000), []),
+        (replace(SHORT, seconds=120), poses_times(1.003), []),
         (replace(SHORT, protocol="ss-cfo"), planted.nothing, []),
         (ANCHORS, planted.nothing, []),
         (replace(SHORT, per_second=7, share=0.0), planted.nothing, []),

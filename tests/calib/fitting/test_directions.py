@@ -1,6 +1,7 @@
 """Antennas whose delay depends on direction: found, corrected and refused, in flights of a separate generator."""
 
 import json
+import re
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -129,6 +130,31 @@ def test_power_that_explains_a_pattern_is_named():
     assert [said for said in found.warnings if "may be an effect of power" in said]
     assert found.calibration.patterns
     assert not [said for said in fitted(TEN, 3).warnings if "may be an effect of power" in said]
+
+
+@pytest.mark.parametrize("seed", [31, pytest.param(32, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("fault", ["scale of true distances", "time offset of true distances"])
+def test_wrong_true_distances_are_not_taken_for_a_pattern(fault, seed):
+    # Robots that head along their loops see distant anchors in one direction, and poses that are late are behind them.
+    data = flown(Recipe(pattern_m=0.0, robots=2, anchors=6, loop=True), seed)[0]
+    larger, later_ns = (1.03, 0) if "scale" in fault else (1.0, 20_000_000)
+    poses = replace(data.poses, position_m=larger * data.poses.position_m, time_ns=data.poses.time_ns + later_ns)
+    found = calib.fit(replace(data, poses=poses), between_m=0.0)
+    assert not found.calibration.patterns
+    assert fault in "".join(one.fault for one in found.findings)
+
+
+@pytest.mark.parametrize("wrong", [True, False])
+def test_a_wrong_lever_arm_is_named_beside_its_pattern(wrong):
+    data = flown(Recipe(pattern_m=0.0 if wrong else 0.2, own=True, robots=3, anchors=4), 33)[0]
+    arms = [one.lever_arm_m + np.array([0.2, 0.1, 0.0]) * (one.tag == 2) for one in data.tags]
+    tags = [replace(one, lever_arm_m=tuple(arm)) for one, arm in zip(data.tags, arms, strict=True)]
+    found = calib.fit(replace(data, tags=tags if wrong else data.tags), between_m=0.0)
+    assert found.calibration.patterns
+    named = [one.evidence for one in found.findings if one.fault == "pattern or wrong lever arm"]
+    # The lever arm is wrong by 22 cm.
+    assert len(named) == wrong
+    assert not wrong or re.search(r"tag 2: .* by 2[0-4] cm", named[0])
 
 
 def test_a_pattern_that_attitudes_do_not_excite_is_refused_with_the_flight_that_would(tmp_path):
