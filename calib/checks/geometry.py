@@ -71,7 +71,7 @@ def scale(view: RecordingView) -> Iterator[Candidate]:
     Errors over power do that, too. Without powers they are unknown, and the check is left out.
     """
     fit = view.quick_fit
-    if fit is None or fit.model.curve is None:
+    if fit is None or fit.model.curve is None or view.standing_m is not None:
         return
     truth_m, error_m = fit.model.ranges.truth_m, view.ranges.error_m
     course = truth_m - np.median(truth_m)

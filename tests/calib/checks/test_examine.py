@@ -106,6 +106,16 @@ def still():
     return [f'bodies.{k}.motion={{ model = "static", position_m = {place} }}' for k, place in enumerate(places)]
 
 
+def all_at(away_m):
+    """Return a planting in which all tags stand at one distance from each other."""
+
+    def plant(flight, _):
+        known = calib.Ranges.from_exchanges(flight.exchanges, poses=flight.poses, tags=flight.tags).truth_m
+        return planted.changed(planted.longer(flight, away_m - known), truth_m=np.full(len(known), away_m))
+
+    return plant
+
+
 WRONG_SIGN = columns(lambda e: {"skew1_ppm": -e.skew1_ppm, "skew2_ppm": -e.skew2_ppm, "range_m": e.range_m * np.nan})
 SS, DS_ALT, SS_CFO = (replace(BRIEF, protocol=name) for name in ("ss", "ds-alt", "ss-cfo"))
 UNREAD = "single-sided without carrier readings"
@@ -161,6 +171,7 @@ UNREAD = "single-sided without carrier readings"
         (BRIEF, late_poses(LATE_NS), "no true distances", ""),
         (ANCHORS, some(lambda e: (e.initiator == 10) & (e.target == 100)), "too few pairs", "tag 10 and tag 100"),
         (SHORT, planted.still, "static data", ""),
+        (SHORT, all_at(10.0), "static data", ""),
         (SHORT, planted.noisy_powers, "power confounded with distance", ""),
         (replace(SHORT, protocol="ss"), planted.nothing, "skew in single-sided ranges", "ss-cfo"),
         (replace(SHORT, protocol="ss-cfo"), WRONG_SIGN, "carrier readings with the wrong sign", ""),
