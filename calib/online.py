@@ -207,14 +207,15 @@ class DelayStates:
 
         The default of `walk_m` was chosen by simulation (`benchmarks/dependences.py`): filters are consistent if ranges
         of one or two tags drift by 2 cm/K over 10 K in two minutes, and those of all others by 2.15 mm/K (DW1000 user
-        manual, section 8.3.1). Raises `BadInputError` for a calibration with constants of pairs.
+        manual, section 8.3.1). Raises `BadInputError` for a calibration with constants of pairs, and for tags without a
+        delay.
         """
         if calibration.pair_offsets:
             raise BadInputError("the calibration has constants of pairs instead of delays; fit it with `constants` tag")
         return cls(
             tags=tuple(tags),
             covariance_m2=(1e-9 * calibration.speed_of_light) ** 2 * calibration.covariance_ns2(tags),
-            delays_ns=np.array([calibration.delays_ns.get(tag, math.nan) for tag in tags]),
+            delays_ns=np.array([calibration.delays_ns[tag] for tag in tags]),
             std_ns=np.array([calibration.delays_std_ns.get(tag, math.nan) for tag in tags]),
             walk_m=walk_m,
             speed_of_light=calibration.speed_of_light,

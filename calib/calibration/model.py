@@ -198,8 +198,11 @@ class Calibration:
     def covariance_ns2(self, tags: Sequence[int]) -> Floats:
         """Return the covariance of some delays (tags, tags) in ns², 0 for those without a finite standard error.
 
-        It is that of the fit if known; otherwise it is diagonal, with the squares of the standard errors.
+        It is that of the fit if known; otherwise it is diagonal, with the squares of the standard errors. Raises
+        `BadInputError` for tags without a delay.
         """
+        if missing := [str(tag) for tag in tags if tag not in self.delays_ns]:
+            raise BadInputError(f"no delay of tag {', '.join(missing)} in the calibration")
         std_ns = np.array([self.delays_std_ns.get(tag, math.nan) for tag in tags])
         found = np.diag(np.where(np.isfinite(std_ns), std_ns, 0.0) ** 2)
         if self.uncertainty is not None:

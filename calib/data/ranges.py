@@ -241,9 +241,15 @@ class Ranges(ColumnTable):
             **given,
         }
         ints = {"initiator": initiator, "target": target, "time_ns": time_ns}
-        with raising(BadInputError, "arrays of ranges have different lengths", TypeError, ValueError):
-            arrays = [np.asarray(column, dtype=np.float64) for column in floats.values()]
-            arrays += [np.asarray(column).astype(np.int64, casting="same_kind") for column in ints.values()]
+        arrays = []
+        for name, column in (floats | ints).items():
+            with raising(BadInputError, f"{name.replace('raw_m', 'range_m')}: expected {'whole ' * (name in ints)}numbers", TypeError, ValueError):
+                arrays.append(
+                    np.asarray(column).astype(np.int64, casting="same_kind")
+                    if name in ints
+                    else np.asarray(column, dtype=np.float64)
+                )
+        with raising(BadInputError, "arrays of ranges have different lengths", ValueError):
             rows = np.broadcast_arrays(*np.atleast_1d(*arrays))
         if rows[0].ndim != 1:
             raise BadInputError(f"has shape {np.shape(range_m)}, expected one dimension", parameter="range_m")

@@ -88,10 +88,12 @@ def read_surveys(data: Data | Iterable[Data], knowledge: Knowledge) -> SurveyDat
     recordings = [_load(one) for one in each(data)]
     if knowledge.spans_s and len(recordings) > 1:
         raise BadInputError("has times of arrangements, which need exactly one recording", parameter="known")
+    stems = [PurePath(ranges.source).stem for ranges, *_ in recordings]
+    stems = [f"{own} {stems[: k + 1].count(own)}" if stems.count(own) > 1 else own for k, own in enumerate(stems)]
     arrangements, numbers, findings = dict[str, Arrangement](), list[Ints](), list[Finding]()
-    for ranges, marked, _ in recordings:
+    for stem, (ranges, marked, _) in zip(stems, recordings, strict=True):
         numbers.append(np.full(len(ranges), -1))
-        for one in _arrangements(ranges, marked, knowledge, several=len(recordings) > 1):
+        for one in _arrangements(ranges, marked, knowledge, stem, several=len(recordings) > 1):
             if one.name in arrangements:
                 text = f"two arrangements have the name {one.name!r:.40}; give each its own name"
                 raise BadInputError(text, parameter="data")
@@ -126,7 +128,7 @@ def _load(data: Data) -> tuple[Ranges, list[Arrangement], list[KnownDistance]]:
 
 
 def _arrangements(
-    ranges: Ranges, marked: list[Arrangement], knowledge: Knowledge, *, several: bool
+    ranges: Ranges, marked: list[Arrangement], knowledge: Knowledge, stem: str, *, several: bool
 ) -> list[Arrangement]:
     if knowledge.spans_s:
         start = int(ranges.time_ns.min())
@@ -140,7 +142,6 @@ def _arrangements(
             f"{ranges.source}: boards never stand still for 15 s; record boards that stand still, or give the times "
             f"of arrangements"
         )
-    stem = PurePath(ranges.source).stem
     if len(found) == 1:
         return [Arrangement(stem, *found[0])]
     return [Arrangement(f"{stem}-{k}" if several else str(k), *span) for k, span in enumerate(found, start=1)]

@@ -285,6 +285,46 @@ def test_frames_with_plain_names_need_no_map_and_note_assumptions():
         assert calib.fit(plain.set_index("stamp")).calibration.delays_ns == result.calibration.delays_ns
 
 
+def test_one_word_in_a_long_column_of_objects_is_one_unusable_row():
+    # DuckDB looks at a sample of a thousand rows, which does not contain this one.
+    count = 2400
+    columns = {"from_id": 1, "to_id": 2, "range_m": np.linspace(1, 5, count).astype(object)}
+    several = pd.DataFrame({"time_s": np.arange(count) * 0.05} | columns)
+    several.loc[3, "range_m"] = "none"
+    with pytest.warns(UserWarning, match="1 of 2400 rows are unusable.*row 4.*'range_m': found 'none'"):
+        loaded = calib.Ranges.from_dataframe(several)
+    assert loaded.raw_m == pytest.approx(several.range_m.drop(3).astype(float))
+
+
+def test_frames_of_boards_that_stand_still_are_arrangements_with_numbers():
+    ranges = calib.sample_arrangements(2)
+    frames = []
+    for half in (0, 1):
+        r = ranges[ranges.time_ns // 40_000_000_000 == half]
+        columns = {"from_id": r.initiator, "to_id": r.target, "range_m": r.raw_m}
+        frames.append(pd.DataFrame({"time_s": r.time_ns * 1e-9} | columns))
+    found = calib.survey(frames, known="line")
+    assert [one.name for one in found.arrangements] == ["data frame 1", "data frame 2"]
+    # Edges of the two arrangements differ by a second.
+    whole = calib.survey(ranges, known="line").calibration
+    assert found.calibration.delays_ns == pytest.approx(whole.delays_ns, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        ({"initiator": ["a", "b"]}, "initiator: expected whole numbers"),
+        ({"time_ns": [0.5, 1.5]}, "time_ns: expected whole numbers"),
+        ({"range_m": ["far", "near"]}, "range_m: expected numbers"),
+        ({"target": [2, 2, 2]}, "different lengths"),
+    ],
+)
+def test_wrong_types_of_arrays_are_named_by_column(columns, said):
+    given = {"range_m": [3.0, 4.0], "initiator": [1, 1], "target": [2, 2]} | columns
+    with pytest.raises(calib.BadInputError, match=said):
+        calib.Ranges.from_arrays(**given)
+
+
 @pytest.mark.parametrize(
     ("call", "error", "said"),
     [

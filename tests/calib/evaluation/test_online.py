@@ -201,6 +201,11 @@ def test_gtsam_finds_the_optimum_of_the_filter_run_forward_and_back(known):
     assert np.abs(changes_m - own[:, 3:]).max() < 0.01 * std_m[3:].min()
 
 
+def test_a_tag_without_a_delay_has_no_state(known):
+    with pytest.raises(BadInputError, match="no delay of tag 99"):
+        DelayStates.of(known, (1, 99))
+
+
 def test_a_factor_has_the_derivatives_of_finite_differences(known):
     gtsam = pytest.importorskip("gtsam", reason=NO_GTSAM)
     both = RangeUpdate.of(known, Ranges.from_arrays([4.0, 4.0], initiator=1, target=12, fpp1_dbm=-85.0))
