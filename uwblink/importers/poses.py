@@ -361,7 +361,11 @@ def _from_text(path: Path, file: TextIO, body: str | None, stated: ColumnMap) ->
             texts = [cells[k] if k < len(cells) else "" for k in (layout.time, *places)]
             texts[0] = _iso_ns(texts[0]) if layout.iso else texts[0]
             found = [number_in(text) for text in texts]
-            if ({text.strip().lower() for text in texts[1:]} <= {"", "nan"} and len(cells) == len(layout.names)) or (
+            # Where a body is lost, its position or its attitude is blank.
+            lost = any(
+                part and {text.strip().lower() for text in part} <= {"", "nan"} for part in (texts[1:4], texts[4:])
+            )
+            if (lost and len(cells) == len(layout.names)) or (
                 layout.gaps and (not any(map(math.isfinite, found[1:])) or not any(found[1:]))
             ):
                 continue

@@ -56,7 +56,8 @@ def test_every_number_of_every_form_in_order_of_time(tmp_path, name, head, order
 
 @pytest.mark.parametrize("cell", ["nan", "NaN", ""])
 def test_rows_in_which_motion_capture_lost_a_body_are_left_out(tmp_path, cell):
-    (tmp_path / "a.csv").write_text(f"{HEADER}0,a,1,2,3,0,0,0,1\n1,a{7 * f',{cell}'}\n2,a,4,5,6,0,0,0,1\n")
+    lost = f"1,a{7 * f',{cell}'}\n1,a{3 * f',{cell}'},0,0,0,1\n1,a,1,2,3{4 * f',{cell}'}\n"
+    (tmp_path / "a.csv").write_text(f"{HEADER}0,a,1,2,3,0,0,0,1\n{lost}2,a,4,5,6,0,0,0,1\n")
     assert read_poses(tmp_path / "a.csv").position_m.tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
