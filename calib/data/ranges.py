@@ -243,12 +243,11 @@ class Ranges(ColumnTable):
         ints = {"initiator": initiator, "target": target, "time_ns": time_ns}
         arrays = []
         for name, column in (floats | ints).items():
-            with raising(BadInputError, f"{name.replace('raw_m', 'range_m')}: expected {'whole ' * (name in ints)}numbers", TypeError, ValueError):
-                arrays.append(
-                    np.asarray(column).astype(np.int64, casting="same_kind")
-                    if name in ints
-                    else np.asarray(column, dtype=np.float64)
-                )
+            whole = name in ints
+            text = f"{name.replace('raw_m', 'range_m')}: expected {'whole ' * whole}numbers"
+            with raising(BadInputError, text, TypeError, ValueError):
+                as_given = np.asarray(column, dtype=None if whole else np.float64)
+                arrays.append(as_given.astype(np.int64, casting="same_kind") if whole else as_given)
         with raising(BadInputError, "arrays of ranges have different lengths", ValueError):
             rows = np.broadcast_arrays(*np.atleast_1d(*arrays))
         if rows[0].ndim != 1:
