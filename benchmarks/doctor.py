@@ -300,6 +300,13 @@ def scaled(flight: Flight, rng: np.random.Generator) -> Flight:
     return replace(flight, poses=replace(flight.poses, position_m=flight.poses.position_m * size))
 
 
+def warming(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Let all ranges become 8 to 25 cm longer while the boards warm up, within the first half or steadily."""
+    share = seconds(flight) / seconds(flight).max()
+    course = 1 - np.exp(-share / 0.2) if rng.random() < 0.5 else share
+    return longer(flight, float(rng.uniform(0.08, 0.25)) * course)
+
+
 def arms_in_mm(flight: Flight, rng: np.random.Generator) -> Flight:
     """Write lever arms in mm."""
     return arms(flight, lambda tag: tuple(1000 * v for v in tag.lever_arm_m))
@@ -447,6 +454,7 @@ FAULTS: Final = (
          names("impossible stamps")),
     Case("positions 2 to 6 % too large or too small", BASE, scaled, names("scale of true distances")),
     Case("the same, one robot among anchors", RIG, scaled, names("scale of true distances"), names("too few pairs")),
+    Case("all ranges become 8 to 25 cm longer", BASE, warming, names("all delays change")),
     Case("poses 0.15 to 1.5 s off", BASE, late_poses, names("pose time offset")),
     Case("true distances 0.15 to 0.6 s off, without poses", BASE,
          lambda f, rng: late_truths(f, int(rng.choice([-1, 1]) * rng.uniform(0.15, 0.6) * 1e9)),

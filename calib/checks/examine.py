@@ -257,11 +257,13 @@ CHECKS: Final = (
     ),
     Check(
         "radio",
-        "Do ranges of all pairs of one tag, and no others, shift by more than 2 cm at one time?",
+        "Do ranges of all pairs of one tag and no others, or of all tags, change by more than 2 cm?",
         "mean shift, the largest of 47 times and all tags", OVER_BLOCKS,
         {
             "delay changed mid-flight": "check antenna and supply voltage of tag {tag}; calibrate the two parts "
             "separately",
+            "all delays change": "let all boards warm up before a recording; if temperatures are recorded, "
+            "`calib fit` corrects for them",
             "delay drifts": "{readings}let tag {tag} warm up, check its supply; calibrate short parts separately",
         },
         residuals.changed_delays,

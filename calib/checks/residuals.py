@@ -246,9 +246,10 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Change:
-    """Ranges of a tag (None: of a pair, or of all tags) grow by `size_m` in one of the courses."""
+    """Ranges of a tag (None: of a pair, or of `all` tags) grow by `size_m` in one of the courses."""
 
     tag: int | None
+    all: bool
     course: int
     size_m: float
     p_value: float
@@ -259,7 +260,7 @@ class Change:
 
 
 def changed_delays(view: RecordingView) -> Iterator[Candidate]:
-    """Find tags whose delay changes during a recording, at once or steadily."""
+    """Find tags whose delay changes during a recording, at once or steadily, and changes of all delays together."""
     fit = view.quick_fit
     # In a shorter recording the 32 stretches of scores would be shorter than the duration of errors.
     if fit is None or fit.blocks.seconds < 10.0:
@@ -271,11 +272,16 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
     cuts = np.linspace(1 / 8, 7 / 8, min(47, 1500 // len(fit.model.pairs.ends)))
     courses = np.column_stack([share[:, None] >= cuts, share])
     by_readings = "fit the dependence on its measured temperature (setting `temperature`); or "
-    for one in changes_of_tags(fit, courses):
+    found = _changes(fit, courses)
+    for one in [*changes_of_tags(found, courses), *(one for one in found if one.all)]:
         fault, what, when = "delay drifts", "drift", "over the recording"
         if one.course < len(cuts):
             when_s = np.ptp(fit.model.ranges.time_ns[: np.argmax(courses[:, one.course]) + 1]) * 1e-9
             fault, what, when = "delay changed mid-flight", "shift", f"{when_s:.0f} s after the start"
+        if one.all:
+            evidence = f"ranges of all tags {what} by {100 * one.size_m:+.1f} cm {when}"
+            yield Candidate("all delays change", evidence, one.p_value)
+            continue
         yield Candidate(
             fault,
             f"ranges of tag {one.tag} {what} by {100 * one.size_m:+.1f} cm {when} {one} do not",
@@ -284,14 +290,14 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
         )
 
 
-def changes_of_tags(fit: QuickFit, courses: Floats) -> Iterator[Change]:
-    """Yield changes of single tags, unless another change shows that the delay did not change.
+def changes_of_tags(found: Sequence[Change], courses: Floats) -> Iterator[Change]:
+    """Yield changes of single tags among those that were found, unless another shows that the delay did not change.
 
     Such changes are one of a pair, or of all tags, at about the same time, and one back to the old value: an obstacle
     that leaves again. An antenna or a voltage belongs to one tag, so other pairs change by at most 40 % of it (a
     judgement).
     """
-    named, found = set[int | None]({None}), _changes(fit, courses)
+    named = set[int | None]({None})
     # Two courses that share less than half of their variance are different changes.
     with np.errstate(invalid="ignore"):  # a constant course is like no other
         same = np.atleast_2d(np.corrcoef(courses.T)) ** 2 > 0.5
@@ -339,7 +345,10 @@ def _changes(fit: QuickFit, courses: Floats) -> list[Change]:
             # degrees.
             size, p_value, rest = fit.offset(courses[:, course], groups[k], tolerance=0.02, tried=len(tags) * width)
             if p_value < BUDGET:
-                found, fit = [*found, Change(tag=whose[k], course=course, size_m=size, p_value=p_value)], rest
+                found, fit = (
+                    [*found, Change(tag=whose[k], all=not k, course=course, size_m=size, p_value=p_value)],
+                    rest,
+                )
                 break
         else:
             break
@@ -382,7 +391,8 @@ def between_recordings(views: Sequence[RecordingView], level: float) -> Iterator
         ends = [(view.exchanges.initiator, view.exchanges.target) for view in (first, second)]
         others = [~(np.isin(a, but) | np.isin(b, but)) for a, b in ends]
         fit = quick_fit([view.chosen(rows) for view, rows in zip((first, second), others, strict=True)])
-        for one in changes_of_tags(fit, (fit.model.ranges.session == 1)[:, None]) if fit else ():
+        second_m = (fit.model.ranges.session == 1)[:, None] if fit else np.empty((0, 1))
+        for one in changes_of_tags(_changes(fit, second_m), second_m) if fit else ():
             yield Candidate(
                 "delay changed between recordings",
                 f"ranges of tag {one.tag} are {100 * one.size_m:+.1f} cm longer in {second.name} than in {first.name} "

@@ -288,6 +288,15 @@ def test_other_changes_are_not_called_a_changed_delay(plan, plant):
     assert "delay changed mid-flight" not in faults(plant(fly(plan, 98), RNG(3)))
 
 
+def test_a_change_of_all_delays_is_named_with_its_size():
+    flight = fly(replace(SHORT, seconds=60), 45)
+    found = only(planted.longer(flight, 0.12 * planted.seconds(flight) / 60), "all delays change")
+    # 4800 ranges at 5 cm: a standard error of 0.3 cm.
+    assert numbers(found.evidence)[0] == pytest.approx(12, abs=1)
+    # Six degrees at both ends, by the DW1000 user manual.
+    assert faults(planted.longer(flight, 0.013 * planted.seconds(flight) / 60)) == []
+
+
 def test_a_step_is_named_with_tag_size_and_time():
     stepped = longer(-0.09, lambda f: planted.of_tag(f, 21) & (planted.seconds(f) > 25))(fly(SHORT, 44), None)
     tag, size_cm, time_s, size_ns, *_ = numbers(only(stepped, "delay changed mid-flight").evidence)
