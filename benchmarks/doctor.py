@@ -399,6 +399,7 @@ def names(*words: str) -> frozenset[str]:
     return frozenset(words)
 
 
+SCALE: Final = names("scale of true distances", "scale of true distances or reflections")
 BASE: Final = Plan()
 ANCHORS: Final = Plan(anchors=4, tags_a_body=1)
 LASTING: Final = "reflections that last"
@@ -452,8 +453,8 @@ FAULTS: Final = (
     Case("a clock set back", Plan(bits=40), clock_set_back, names("recordings mixed by their times")),
     Case("`rx2` rounded to 10⁷", BASE, lambda f, _: changed(f, rx2=f.exchanges.rx2 // 10**7 * 10**7),
          names("impossible stamps")),
-    Case("positions 2 to 6 % too large or too small", BASE, scaled, names("scale of true distances")),
-    Case("the same, one robot among anchors", RIG, scaled, names("scale of true distances"), names("too few pairs")),
+    Case("positions 2 to 6 % too large or too small", BASE, scaled, SCALE),
+    Case("the same, one robot among anchors", RIG, scaled, SCALE, names("too few pairs")),
     Case("all ranges become 8 to 25 cm longer", BASE, warming, names("all delays change")),
     Case("poses 0.15 to 1.5 s off", BASE, late_poses, names("pose time offset")),
     Case("true distances 0.15 to 0.6 s off, without poses", BASE,

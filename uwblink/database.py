@@ -63,8 +63,8 @@ def connect(
     db = duckdb.connect(place, read_only=read_only, config=config)
     db.execute("SET TimeZone = 'UTC'")
     db.execute("SET enable_progress_bar = false")
-    # Columns of objects in data frames are text: a type that is found in a sample may not fit all rows.
-    db.execute("SET pandas_analyze_sample = 0")
+    # A type that is found in a smaller sample of a data frame's objects may not fit all rows.
+    db.execute("SET pandas_analyze_sample = 10_000_000")
     # What is allowed can be set only while access is open.
     db.execute("SET allowed_paths = ?", [named])
     db.execute("SET allowed_directories = ?", [within])

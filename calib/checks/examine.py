@@ -198,8 +198,10 @@ CHECKS: Final = (
         "Do errors grow with the true distances by more than 0.5 %?",
         "slope of errors over true distances; reflections of far ranges may cause a part of it", OVER_BLOCKS,
         {
-            "scale of true distances": "check the calibration of motion capture or the tape, and the unit; measure one "
-            "long distance again"
+            "scale of true distances": "check the calibration of motion capture or the tape; measure a long distance "
+            "again",
+            "scale of true distances or reflections": "measure a long distance again; if it is right, record in the "
+            "open",
         },
         geometry.scale,
     ),

@@ -88,9 +88,13 @@ def scale(view: RecordingView) -> Iterator[Candidate]:
         slope, p_value, rest = fit.offset(course, tolerance=SCALE + growth)
     if robust_spread(rest.residual, 0.0) > ASTRAY_M:
         return
+    fault, way = "scale of true distances", "long"
+    if slope > 0:
+        # Reflections with short detours are not seen singly, and lengthen far ranges, too.
+        fault, way = "scale of true distances or reflections", "short, or far ranges reflected"
     yield Candidate(
-        "scale of true distances",
-        f"ranges change as if true distances were {100 * abs(slope):.1f} % too {'short' if slope > 0 else 'long'}",
+        fault,
+        f"ranges change as if true distances were {100 * abs(slope):.1f} % too {way}",
         p_value,
         # Errors over power may hide the decrease in the plain errors, by which other faults are compared.
         gain=max(

@@ -270,7 +270,8 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
     # reflections last, and their variance is unknown. Times are so close that a step between two loses 1 % of its size;
     # for many pairs there are fewer, to save memory.
     cuts = np.linspace(1 / 8, 7 / 8, min(47, 1500 // len(fit.model.pairs.ends)))
-    courses = np.column_stack([share[:, None] >= cuts, share])
+    # The last two are a steady drift, and a board that warms up at the beginning.
+    courses = np.column_stack([share[:, None] >= cuts, share, 1 - np.exp(-5 * share)])
     by_readings = "fit the dependence on its measured temperature (setting `temperature`); or "
     found = _changes(fit, courses)
     for one in [*changes_of_tags(found, courses), *(one for one in found if one.all)]:

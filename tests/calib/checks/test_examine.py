@@ -117,6 +117,7 @@ def all_at(away_m):
 
 
 WRONG_SIGN = columns(lambda e: {"skew1_ppm": -e.skew1_ppm, "skew2_ppm": -e.skew2_ppm, "range_m": e.range_m * np.nan})
+SCALE = "scale of true distances"
 SS, DS_ALT, SS_CFO = (replace(BRIEF, protocol=name) for name in ("ss", "ds-alt", "ss-cfo"))
 UNREAD = "single-sided without carrier readings"
 
@@ -134,9 +135,9 @@ UNREAD = "single-sided without carrier readings"
         (BRIEF, poses_times(100), "unit of the poses", 'distance = "cm"'),
         (BRIEF, poses_times(1 / 0.0254), "unit of the poses", 'distance = "in"'),
         (BRIEF, poses_times(1 / 0.3048), "unit of the poses", 'distance = "ft"'),
-        (SHORT, poses_times(1.03), "scale of true distances", r"(2\.[6-9]|3\.[0-4]) % too long"),
-        (SHORT, poses_times(0.97), "scale of true distances", r"(2\.[6-9]|3\.[0-4]) % too short"),
-        (replace(SHORT, share=0.2, lasts_s=1.0), poses_times(0.95), "scale of true distances", "% too short"),
+        (SHORT, poses_times(1.03), SCALE, r"(2\.[6-9]|3\.[0-4]) % too long"),
+        (SHORT, poses_times(0.97), f"{SCALE} or reflections", r"(2\.[6-9]|3\.[0-4]) % too short"),
+        (replace(SHORT, share=0.2, lasts_s=1.0), poses_times(0.95), f"{SCALE} or reflections", "% too short"),
         (BRIEF, partial(bare, many=1000.0), "unit of the ranges", 'distance = "mm"'),
         (BRIEF, partial(bare, many=100.0), "unit of the ranges", 'distance = "cm"'),
         (BRIEF, partial(bare, truth=False), "unit of the ranges", ""),
