@@ -219,8 +219,8 @@ def _beyond_noise(model: RangeModel, louder_m: Floats, noise: Tested, tried: int
     """Yield a finding if errors beside the readings of power are larger than the noise of readings causes.
 
     They grow with distance. A scale of true distances has this effect, and so has noise that lasts, which differences
-    of successive readings do not show. Such noise of up to a quarter of the signal is a tolerance: in flights without
-    it (`make sound`), errors beside the readings are those of 0.15 and less.
+    of successive readings do not show. Such noise of up to a quarter of the signal is a tolerance: in nine kinds of
+    sound flights (`make sound`), the ratio is up to 0.15.
     """
     size_m = _root_mean_square(_beside_readings(model, louder_m))
     ratio = noise_to_signal(model)
@@ -228,8 +228,8 @@ def _beyond_noise(model: RangeModel, louder_m: Floats, noise: Tested, tried: int
         # Noise makes ranges longer where powers are higher than expected from the distance.
         if one.offset_m > 0:
             evidence = (
-                f"ranges depend on distance beside power as with noise of {one.offset_m / size_m:.1f} times the "
-                f"variance of powers; successive readings show {ratio:.2f}"
+                f"ranges depend on distance as if the noise of powers had {one.offset_m / size_m:.1f} times the "
+                f"variance of the powers themselves; successive readings show a noise of {ratio:.2f}"
             )
             causes = ("scale of true distances", "noisy powers")
             yield combined([warning(causes[0], evidence, one.p_value), warning(causes[1], "the powers are noisy")])

@@ -61,8 +61,7 @@ def pose_clock(view: RecordingView) -> Iterator[Candidate]:
 
 
 SCALE: Final = 0.005
-"""Relative error of sound true distances. A tape or a calibration of motion capture reaches 0.1 to 0.3 %; where nothing
-is wrong with true distances, flights of seven generators have slopes of up to 0.4 % (`make sound`)."""
+"""Relative error of sound true distances. Calibrations of motion capture and tapes have up to 0.3 % (a judgement)."""
 
 
 def scale(view: RecordingView) -> Iterator[Candidate]:

@@ -392,8 +392,8 @@ def between_recordings(views: Sequence[RecordingView], level: float) -> Iterator
         ends = [(view.exchanges.initiator, view.exchanges.target) for view in (first, second)]
         others = [~(np.isin(a, but) | np.isin(b, but)) for a, b in ends]
         fit = quick_fit([view.chosen(rows) for view, rows in zip((first, second), others, strict=True)])
-        second_m = (fit.model.ranges.session == 1)[:, None] if fit else np.empty((0, 1))
-        for one in changes_of_tags(_changes(fit, second_m), second_m) if fit else ():
+        course = (fit.model.ranges.session == 1)[:, None] if fit else np.empty((0, 1))
+        for one in changes_of_tags(_changes(fit, course), course) if fit else ():
             yield Candidate(
                 "delay changed between recordings",
                 f"ranges of tag {one.tag} are {100 * one.size_m:+.1f} cm longer in {second.name} than in {first.name} "
