@@ -227,12 +227,12 @@ def _beyond_noise(model: RangeModel, louder_m: Floats, noise: Tested, tried: int
     for one in offsets_of(noise, tried, FIT_LEVELS["offsets"], (0.25 + ratio) * size_m):
         # Noise makes ranges longer where powers are higher than expected from the distance.
         if one.offset_m > 0:
-            evidence = (
-                f"ranges depend on distance as if the noise of powers had {one.offset_m / size_m:.1f} times the "
-                f"variance of the powers themselves; successive readings show a noise of {ratio:.2f}"
+            lasting = (
+                f"the noise of powers lasts, with {one.offset_m / size_m:.1f} times the variance of the powers "
+                f"(between successive readings: {ratio:.2f})"
             )
-            causes = ("scale of true distances", "noisy powers")
-            yield combined([warning(causes[0], evidence, one.p_value), warning(causes[1], "the powers are noisy")])
+            scale = "ranges depend on distance as with true distances of another scale"
+            yield combined([warning("scale of true distances", scale, one.p_value), warning("noisy powers", lasting)])
 
 
 def noise_of_readings(power: Floats, pair: Ints, time_ns: Ints) -> float:
