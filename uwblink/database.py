@@ -63,7 +63,7 @@ def connect(
     db = duckdb.connect(place, read_only=read_only, config=config)
     db.execute("SET TimeZone = 'UTC'")
     db.execute("SET enable_progress_bar = false")
-    # A type that is found in a smaller sample of a data frame's objects may not fit all rows.
+    # Types of a data frame's objects are found from up to ten million rows, because those of a sample may not fit all.
     db.execute("SET pandas_analyze_sample = 10_000_000")
     # What is allowed can be set only while access is open.
     db.execute("SET allowed_paths = ?", [named])

@@ -227,12 +227,11 @@ def _beyond_noise(model: RangeModel, louder_m: Floats, noise: Tested, tried: int
     for one in offsets_of(noise, tried, FIT_LEVELS["offsets"], (0.25 + ratio) * size_m):
         # Noise makes ranges longer where powers are higher than expected from the distance.
         if one.offset_m > 0:
-            lasting = (
-                f"the noise of powers lasts, with {one.offset_m / size_m:.1f} times the variance of the powers "
-                f"(between successive readings: {ratio:.2f})"
+            evidence = (
+                f"ranges depend on distance as with true distances of another scale; the noise of successive readings "
+                f"of power, {ratio:.2f} of the variance of powers, is too small for this"
             )
-            scale = "ranges depend on distance as with true distances of another scale"
-            yield combined([warning("scale of true distances", scale, one.p_value), warning("noisy powers", lasting)])
+            yield _with_noisy_powers(warning("scale of true distances", evidence, one.p_value))
 
 
 def noise_of_readings(power: Floats, pair: Ints, time_ns: Ints) -> float:

@@ -246,10 +246,10 @@ def closures(view: RecordingView) -> Iterator[Candidate]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Change:
-    """Ranges of a tag (None: of a pair, or of `all` tags) grow by `size_m` in one of the courses."""
+    """Ranges of a tag (None: of a pair, or of all tags: `common`) grow by `size_m` in one of the courses."""
 
     tag: int | None
-    all: bool
+    common: bool
     course: int
     size_m: float
     p_value: float
@@ -270,16 +270,17 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
     # reflections last, and their variance is unknown. Times are so close that a step between two loses 1 % of its size;
     # for many pairs there are fewer, to save memory.
     cuts = np.linspace(1 / 8, 7 / 8, min(47, 1500 // len(fit.model.pairs.ends)))
-    # The last two are a steady drift, and a board that warms up at the beginning.
+    # The last two are a steady drift, and boards that warm up, with a time constant of a fifth of the recording (a
+    # judgement: between a step and a drift).
     courses = np.column_stack([share[:, None] >= cuts, share, 1 - np.exp(-5 * share)])
     by_readings = "fit the dependence on its measured temperature (setting `temperature`); or "
     found = _changes(fit, courses)
-    for one in [*changes_of_tags(found, courses), *(one for one in found if one.all)]:
+    for one in [*changes_of_tags(found, courses), *(one for one in found if one.common)]:
         fault, what, when = "delay drifts", "drift", "over the recording"
         if one.course < len(cuts):
             when_s = np.ptp(fit.model.ranges.time_ns[: np.argmax(courses[:, one.course]) + 1]) * 1e-9
             fault, what, when = "delay changed mid-flight", "shift", f"{when_s:.0f} s after the start"
-        if one.all:
+        if one.common:
             evidence = f"ranges of all tags {what} by {100 * one.size_m:+.1f} cm {when}"
             yield Candidate("all delays change", evidence, one.p_value)
             continue
@@ -346,10 +347,8 @@ def _changes(fit: QuickFit, courses: Floats) -> list[Change]:
             # degrees.
             size, p_value, rest = fit.offset(courses[:, course], groups[k], tolerance=0.02, tried=len(tags) * width)
             if p_value < BUDGET:
-                found, fit = (
-                    [*found, Change(tag=whose[k], all=not k, course=course, size_m=size, p_value=p_value)],
-                    rest,
-                )
+                found.append(Change(tag=whose[k], common=not k, course=course, size_m=size, p_value=p_value))
+                fit = rest
                 break
         else:
             break

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import calib
 import uwbsim
+from benchmarks import directions
 from benchmarks import doctor as planted
 from benchmarks.flights import LIGHT, Plan, fly
 from tests.processes import succeed
@@ -294,7 +295,11 @@ def test_a_change_of_all_delays_is_named_with_its_size():
     found = only(planted.longer(flight, 0.12 * planted.seconds(flight) / 60), "all delays change")
     # 4800 ranges at 5 cm: a standard error of 0.3 cm.
     assert numbers(found.evidence)[0] == pytest.approx(12, abs=1)
-    # Six degrees at both ends, by the DW1000 user manual.
+    warm = planted.longer(flight, 0.09 * (1 - np.exp(-planted.seconds(flight) / 12)))
+    # A time constant of 12 s; the course that is fitted has the same one.
+    assert numbers(only(warm, "all delays change").evidence)[0] == pytest.approx(9, abs=1)
+    assert faults(planted.longer(flight, 0.04 * (1 - np.exp(-planted.seconds(flight) / 20)))) == ["all delays change"]
+    # Three degrees at both ends, by the DW1000 user manual.
     assert faults(planted.longer(flight, 0.013 * planted.seconds(flight) / 60)) == []
 
 
@@ -340,6 +345,19 @@ def test_pairs_behind_a_cabinet_are_named():
     room = uwbsim.simulate(uwbsim.load("room/room", {"run.duration_s": 60.0, "run.seed": 50_004}))
     named = [one.evidence.split()[3] for one in calib.examine(room) if one.fault == "pairs that do not close"]
     assert sorted(named) == ["1-30", "1-31"]
+
+
+def test_detours_of_far_ranges_are_not_called_a_scale():
+    # A third of the ranges is reflected, and errors grow by 5 % of the distance.
+    room = uwbsim.simulate(uwbsim.load("room/room", {"run.duration_s": 60.0, "run.seed": 500}))
+    assert not any(SCALE in fault for fault in faults(room))
+
+
+@pytest.mark.parametrize("factor", [0.95, 1.1])
+def test_a_scale_is_named_where_a_lever_arm_explains_a_part_of_it(factor):
+    # Robots that head along their loops: a lever arm of 0.2 m gains half as much as the scale.
+    data = directions.flight(directions.Recipe(pattern_m=0.0, robots=2, anchors=6, loop=True), 600)[0]
+    assert SCALE in faults(poses_times(factor)(data, None))[0]
 
 
 def with_places(flight, places):
