@@ -157,6 +157,12 @@ WORDS = [
     ("calib report no.uwb -o r.html", ["no.uwb", "no such"]),
     ("calib export {c_json} --to csv -o no/out.csv", ["no"]),
     ("uwblink import csv {t_csv_gz} -o o.uwb", ["t.csv.gz", "gzip"]),
+    ("uwblink import csv {f_uwb} -o o.uwb", ["f.uwb", "not a text file"]),
+    # A file or folder that is no recording would not open as one.
+    ("uwblink import guess {r_csv} -o o.uwb", ["o.uwb", ".uwb is the ending of recordings"]),
+    ("calib fit {f_uwb} -o o.uwb", ["o.uwb", ".uwb is the ending of recordings"]),
+    ("calib apply {f_uwb} -c {c_json} --to csv -o o.uwb", ["o.uwb", ".uwb is the ending of recordings"]),
+    ("uwbsim compare noiseless -o o.uwb", ["o.uwb", ".uwb is the ending of recordings"]),
     # A recording that is given twice, also under another name, would count as twice the evidence.
     ("calib fit {f_uwb} {f_uwb} -o o.json", ["f.uwb"]),
     ("calib evaluate {again_uwb} {f_uwb} -c {c_json}", ["f.uwb"]),

@@ -16,6 +16,7 @@ from uwblink.errors import ArgumentError, OutputError, RecordingError, Recording
 
 __all__ = [
     "check_apart",
+    "check_ending",
     "check_folder",
     "check_output",
     "interrupts_held",
@@ -174,8 +175,10 @@ def check_apart(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = ())
 def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
     """Raise an error if `path` cannot be written; writes nothing.
 
-    A `recording` must not have the suffix of another format.
+    A `recording` must not have the suffix of another format, and other outputs not that of a recording.
     """
+    if not recording:
+        check_ending(path)
     is_other = path.suffix.lower() in (
         ".csv", ".tsv", ".txt", ".gz", ".parquet", ".json", ".jsonl", ".ndjson", ".bag", ".mcap", ".db3", ".toml",
         ".html", ".pdf",
@@ -206,6 +209,12 @@ def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
             raise error(f"{path}: {why}")
 
 
+def check_ending(path: Path) -> None:
+    """Raise `OutputError` if an output that is not a recording has the suffix of recordings."""
+    if path.suffix.lower() == ".uwb":
+        raise OutputError(f"{path}: .uwb is the ending of recordings, and this output is none; give another name")
+
+
 def check_folder(path: Path, names: Iterable[str] = (), *, force: bool = False) -> None:
     """Raise `OutputError` if a folder can be neither used nor created.
 
@@ -213,6 +222,7 @@ def check_folder(path: Path, names: Iterable[str] = (), *, force: bool = False) 
     """
     if path.exists() and not path.is_dir():
         raise OutputError(f"{path}: is a file, expected a folder")
+    check_ending(path)
     if not path.parent.is_dir():
         raise OutputError(f"{path}: {path.parent} does not exist")
     for name in names if path.is_dir() else ():

@@ -77,6 +77,8 @@ def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, boo
     with reading(path), open_file(path) as file:
         raw = file.read(65_536)
         _refuse_utf16(path, raw)
+        if b"\0" in raw:
+            raise ImportTableError(f"{path}: not a text file (it contains bytes of zero), expected a table in UTF-8")
         # A letter of several bytes may be cut at the end of the read bytes.
         lines = raw.decode("utf-8-sig", errors="strict" if len(raw) < 65_536 else "ignore").splitlines()
         first = next((k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
