@@ -1,7 +1,7 @@
 """Maximum likelihood of delays, curve, errors and trajectories together, from an initial guess of trajectories.
 
-Ranges first have Cauchy's likelihood, which converges from far away, then that of `calib.range_errors`. The parameters
-of errors and the motion are fitted alternately. The variance of jerk and the standard deviations of accelerometers and
+Ranges first have Cauchy's likelihood, which converges from far away, then that of `calib.range_errors`, whose
+parameters are unknowns like those of the motion. The variance of jerk and the standard deviations of accelerometers and
 height sensors are estimated as well.
 """
 
@@ -211,43 +211,28 @@ class Search:
         self.optimize(errors)
 
     def fit_likelihood(self) -> None:
-        """Maximise the likelihood of direct, reflected and outlying ranges.
+        """Maximise the restricted likelihood of direct, reflected and outlying ranges in all unknowns at once.
 
-        Motion and errors are fitted alternately: the joint likelihood is unbounded if a path fits some ranges exactly
-        and their noise is zero.
+        Motion and errors in turn can end in a local maximum: errors that fit a wrong motion keep it wrong.
         """
         mixture, unknowns, parts = self.model.error_model(self.residuals())
-        few = self.free_ranges < MIN_RANGES_PER_PAIR * len(self.model.pairs.ends)
-        if few:
+        if self.free_ranges < MIN_RANGES_PER_PAIR * len(self.model.pairs.ends):
             unknowns = tuple(u if len(u.names) == 1 else _as_known(u, u.start) for u in unknowns)
-        errors, delays, settled = replace(mixture, expected=True), self.values["delay"], False
-        # At most eight rounds; they end if no delay moves by more than a tenth of its standard error.
-        for turn in range(8):
-            # The parameters of errors, from the residuals.
-            layout, rows = self.model.build(self.residuals(), mixture, unknowns, parts, only=())
-            priors = Priors(layout)
-            priors.recall(self.weights)
-            found = maximize([rows.sample(self.informative_rows())], priors, layout.start(self.values), tolerance=0.1)
-            self.values |= found.by_kind()
-            self.weights |= priors.by_key()
-            # The motion, with these parameters.
-            self.build(errors, tuple(_as_known(unknown, self.values[unknown.kind]) for unknown in unknowns), parts)
-            found = self.optimize(errors, evidence_steps=0 if turn > 1 else 12, tolerance=0.03, steps=20)
+        self.build(mixture, unknowns, parts)
+        own, settled = self.layout.where["delay"], False
+        # At most five rounds, because leverages change; they end if no delay moves by a tenth of its standard error.
+        for turn in range(5):
+            delays = self.values["delay"]
+            self._restrict()
+            found = self.optimize(mixture, evidence_steps=12 if turn < 3 else 0, tolerance=0.03 if turn else 0.1)
             if turn == 0:
                 self.update_sensor_errors()
-            own = self.layout.where["delay"]
             std = np.sqrt(np.maximum(np.diag(found.covariance[:, own][own]), 1e-12))
-            moved, delays = np.abs(found.x[own] - delays), found.x[own]
-            settled = turn > 1 and bool(np.all(moved < 0.1 * std))
+            settled = turn > 0 and bool(np.all(np.abs(found.x[own] - delays) < 0.1 * std))
             if settled:
                 break
-        # The parameters of errors are unknowns as well: the covariance contains them.
-        self.build(errors, unknowns, parts)
-        if not few:
-            self._restrict()
-            self.optimize(mixture, tolerance=0.03, steps=20)
         self._restrict()
-        found = self.optimize(errors, tolerance=np.inf)
+        found = self.optimize(replace(mixture, expected=True), tolerance=np.inf)
         self.optimum = replace(found, success=settled)
 
     def missed_motion_m(self) -> float:
