@@ -250,6 +250,11 @@ TAGS = "[[tags]]\nid = 1\nbody = 'robot1'\n"
 TAGS_LINE = "uwblink poses {f_uwb} --from {poses_csv} --tags own.toml"
 OWN = [
     # Nested too deeply.
+    (
+        "uwblink import csv {r_csv} --map own.toml -o o.uwb",
+        ["r.csv", "constants.from_id", "'to_id'", "[columns]"],
+        '[constants]\nfrom_id = "to_id"\n',
+    ),
     *((line, ["own.toml"], DEEP) for line in (
         "uwbsim validate own.toml",
         "uwbsim sweep own.toml -o o",

@@ -253,6 +253,10 @@ def staged_cells(table: SourceTable) -> dict[str, str]:
             found[name] = power_sql(CHIPS[column_map.chip or "other"], column_map.prf, cells)
             continue
         if name in constants:
+            value = constants[name]
+            if value in table.names and value not in column_map.columns.values():
+                why = f"{value!r:.40} is the name of a column; state it in [columns], or rename the column"
+                raise ImportTableError(f"{table.path}: constants.{name}: {why}")
             text = f"getvariable('{name}')"
         elif header in table.names or name in column_map.columns or name == "to_id" or (name in IDS and not table.live):
             text = table.text(header, numeric=name not in ALL_IDS)
