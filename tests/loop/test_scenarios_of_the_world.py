@@ -17,12 +17,12 @@ from benchmarks.nlos import (
     published_error_m,
     vendor_rule,
 )
-from calib import fit, load_ranges
-from calib.evaluation.statistics import evaluate, pair_rows
+from calib import evaluate, fit, load_ranges
+from calib.evaluation.statistics import pair_rows
 from tests.processes import succeed
 from tests.shared_data import ROOT, shared
+from uwblink import SPEED_OF_LIGHT
 from uwblink import load as load_recording
-from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim import load, simulate
 
 SCENARIOS = ROOT / "scenarios"

@@ -12,16 +12,15 @@ import uwblink
 from benchmarks.hours import RATE_HZ, AnsweringPorts
 from tests.boards import bench_scenario, record_bench
 from tests.processes import wait_until
-from uwblink import Listener, RangingPlan
+from uwblink import Listener, RangingPlan, Recording
 from uwblink.boards import record as writing
 from uwblink.boards.record import RecordingWriter, append_rows, identify
 from uwblink.boards.recorder import Recorder
 from uwblink.errors import RecordingError
-from uwblink.recording.file import Recording
 from uwblink.recording.schema import FrameRow
 from uwblink.recording.store import Store
-from uwblink.wire.messages import RangeReport
-from uwbsim.boards.virtual_board import VirtualPorts
+from uwblink.wire import RangeReport
+from uwbsim import VirtualPorts
 
 
 def recorded(path, *listeners, ports=None, seconds=2.0):

@@ -19,13 +19,12 @@ import uwblink
 from tests.boards import bench_scenario, record_bench, served
 from tests.browser import chromium
 from tests.processes import BIN, wait_until
-from uwblink.boards import live_page
-from uwblink.boards.listeners import PairState, Progress, Turn, load_correction
-from uwblink.boards.live_page import LivePage
+from uwblink.boards import LivePage, Progress, live_page, load_correction
+from uwblink.boards.listeners import PairState, Turn
 from uwblink.errors import PlanError, PortError
 from uwblink.recording.schema import Fault
-from uwblink.wire.messages import RangeReport
-from uwbsim.boards.virtual_board import VirtualPorts
+from uwblink.wire import RangeReport
+from uwbsim import VirtualPorts
 
 
 def fetch(page, path="", method="GET", **headers):

@@ -12,14 +12,12 @@ import pytest
 
 from tests.boards import bench_scenario, record_bench, served
 from tests.processes import BIN, wait_until
-from uwblink import RangingPlan, Recording, load, record
-from uwblink.boards import decode_again
-from uwblink.boards.listeners import Listener, Progress
+from uwblink import Arrangement, Listener, RangingPlan, Recording, Tag, load, raw_range, record
+from uwblink.boards import Progress, decode_again
 from uwblink.errors import PlanError, PortMissingError, RecordingError, RecordingExistsError
-from uwblink.recording.schema import Arrangement, FrameRow, Tag
-from uwblink.twr import raw_range
+from uwblink.recording.schema import FrameRow
 from uwblink.wire.messages import IdReport, Skipped
-from uwbsim.boards.virtual_board import VirtualPorts
+from uwbsim import VirtualPorts
 
 
 def stored(path):

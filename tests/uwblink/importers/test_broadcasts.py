@@ -13,11 +13,10 @@ from tests import processes
 from tests.errors import one_line
 from tests.shared_data import shared
 from tests.uwblink.test_receptions import PLACES, broadcasts
-from uwblink import raw_range
+from uwblink import load, raw_range
 from uwblink.errors import ImportTableError
 from uwblink.importers import import_file, read_source
 from uwblink.importers.guess import guess_map
-from uwblink.recording.contents import load
 
 NAMES = [f"0x{tag:04X}" for tag in (0xE621, 0x9042, 0x853C, 0xBB1E)]
 

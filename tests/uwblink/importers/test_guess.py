@@ -19,11 +19,10 @@ from tests.uwblink.importers.test_table_forms import (
     wrapped,
     write,
 )
+from uwblink import import_recording, load
 from uwblink.errors import ImportTableError
-from uwblink.importers import import_recording
 from uwblink.importers.column_map import load_map
 from uwblink.importers.guess import guess_map
-from uwblink.recording.contents import load
 from uwblink.ticks import TICKS_PER_SECOND
 
 POLL = ("poll_tx", "poll_rx", "resp_tx", "resp_rx", "final_tx", "final_rx")

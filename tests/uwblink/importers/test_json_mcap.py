@@ -8,13 +8,11 @@ import pytest
 
 from tests.errors import one_line
 from tests.uwblink.importers.test_bag_guess import by_guess
+from uwblink import Contents, Exchanges, Poses
 from uwblink.errors import ImportTableError
 from uwblink.exporters import export_recording
 from uwblink.importers import read_source
 from uwblink.importers.poses import read_poses
-from uwblink.recording.contents import Contents
-from uwblink.recording.schema import Poses
-from uwblink.twr import Exchanges
 
 WHEN = 1_706_822_508_042_560_815
 

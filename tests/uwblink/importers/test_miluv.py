@@ -9,11 +9,10 @@ import pytest
 
 from tests.errors import one_line
 from tests.shared_data import miluv
+from uwblink import import_recording, load, raw_range
 from uwblink.errors import ImportTableError
-from uwblink.importers import import_recording
-from uwblink.recording.contents import load
 from uwblink.recording.distances import distances_m
-from uwblink.twr import STAMPS, raw_range
+from uwblink.twr import STAMPS
 
 TICK_NS = 1e9 / (128 * 499.2e6)
 AIR = 299_702_547.0

@@ -9,12 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from tests import processes
 from tests.errors import one_line
+from uwblink import Contents, Exchanges, Tag, load
 from uwblink.errors import ImportTableError
 from uwblink.importers.poses import read_poses
-from uwblink.recording.contents import Contents, load
 from uwblink.recording.distances import distances_m
-from uwblink.recording.schema import Tag
-from uwblink.twr import Exchanges
 
 COUNT, RATE = 30, 100.0
 TIMES = np.arange(COUNT) / RATE

@@ -10,14 +10,13 @@ import pytest
 import uwbsim
 from tests import processes
 from tests.errors import one_line
+from uwblink import Contents, Exchanges, Poses, Tag, load
 from uwblink.errors import ImportTableError, PlanError, RecordingExistsError
 from uwblink.exporters import export_recording
 from uwblink.importers import add_poses
 from uwblink.importers.poses import read_poses
-from uwblink.recording.contents import Contents, load
 from uwblink.recording.distances import distances_m
-from uwblink.recording.schema import Poses, Tag
-from uwblink.twr import STAMPS, Exchanges
+from uwblink.twr import STAMPS
 from uwbsim.boards.server import LivePoses
 from uwbsim.world.world import World
 

@@ -7,10 +7,9 @@ import pytest
 
 from tests.processes import succeed
 from tests.registered import registered
+from uwblink import Contents, Exchanges, import_recording, load, register_importer
 from uwblink.errors import ArgumentError, ImportTableError, RecordingExistsError
-from uwblink.importers import IMPORTERS, Importer, import_recording, register_importer
-from uwblink.recording.contents import Contents, load
-from uwblink.twr import Exchanges
+from uwblink.importers import IMPORTERS, Importer
 
 
 def read_blanks(source, map_file):

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from tests.errors import one_line
+from uwblink import import_recording, load, raw_range
 from uwblink.errors import ArgumentError, ImportTableError
-from uwblink.importers import import_recording, read_source
+from uwblink.importers import read_source
 from uwblink.importers.tables import SourceTable, connected
-from uwblink.recording.contents import load
-from uwblink.twr import raw_range
 
 TICKS = 128 * 499_200_000
 AIR = 299_702_547.0

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 
 from tests.uwblink.recording.test_file import random_exchanges
-from uwblink import exporters
+from uwblink import Arrangement, Contents, Exchanges, KnownDistance, Poses, Recording, Tag, exporters, load
 from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError
 from uwblink.exporters import export_recording, mcap
-from uwblink.recording.contents import Contents, exchanges_with_poses, load, pieces
+from uwblink.recording.contents import exchanges_with_poses, pieces
 from uwblink.recording.distances import distances_m
-from uwblink.recording.file import Recording
-from uwblink.recording.schema import TABLES, Arrangement, CirRow, Fault, FrameRow, KnownDistance, Poses, Tag
-from uwblink.twr import Exchanges
+from uwblink.recording.schema import TABLES, CirRow, Fault, FrameRow
 
 HEARD = {name: 7.5 if kind == "DOUBLE" else 3 for name, kind in TABLES["overheard"].items()}
 CIRS = [

@@ -15,12 +15,10 @@ import pytest
 from tests import processes
 from tests.boards import record_bench
 from tests.errors import one_line
-from uwblink import Listener, RangingPlan
+from uwblink import Contents, Exchanges, Listener, Poses, RangingPlan, Recording, Tag, load
 from uwblink.errors import RecordingError, RecordingExistsError, RecordingInUseError, RecordingMissingError
-from uwblink.recording.contents import Contents, load
-from uwblink.recording.file import Recording
-from uwblink.recording.schema import TABLES, CirRow, Fault, Poses, Tag
-from uwblink.twr import COLUMNS, Exchanges
+from uwblink.recording.schema import TABLES, CirRow, Fault
+from uwblink.twr import COLUMNS
 
 
 def random_exchanges(n=50, seed=1):

@@ -9,12 +9,10 @@ import pytest
 
 from tests.errors import one_line
 from tests.uwblink.recording.test_file import change, random_exchanges
+from uwblink import Contents, Recording, Tag
 from uwblink.errors import RecordingError
 from uwblink.exporters import export_recording
 from uwblink.recording import store
-from uwblink.recording.contents import Contents
-from uwblink.recording.file import Recording
-from uwblink.recording.schema import Tag
 
 
 @pytest.fixture(scope="module")

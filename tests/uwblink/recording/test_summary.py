@@ -10,14 +10,13 @@ from rich.console import Console
 
 import calib
 import uwblink
-from calib.checks.examine import examine
+from calib import examine
 from tests.boards import bench_scenario, record_bench
 from tests.uwblink.recording.test_file import random_exchanges
+from uwblink import Contents, Exchanges, Recording, Tag
 from uwblink.boards.listeners import ReportCheck
 from uwblink.cli.commands import print_summary
-from uwblink.recording.contents import Contents
-from uwblink.recording.file import Recording
-from uwblink.recording.schema import Fault, Tag
+from uwblink.recording.schema import Fault
 from uwblink.recording.summary import (
     clock_skews,
     differences,
@@ -26,9 +25,9 @@ from uwblink.recording.summary import (
     skew_summary,
     summarize,
 )
-from uwblink.twr import COLUMNS, STAMPS, Exchanges
+from uwblink.twr import COLUMNS, STAMPS
 from uwblink.wire.messages import RangeReport, TargetRangeReport
-from uwbsim.boards.virtual_board import VirtualPorts
+from uwbsim import VirtualPorts
 
 
 @pytest.fixture
