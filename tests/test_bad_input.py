@@ -17,13 +17,10 @@ import pytest
 import calib
 import uwblink
 import uwbsim
-from calib.errors import BadInputError
 from tests.boards import bench_scenario, record_bench, served
 from tests.processes import refuse, run, succeed
 from tests.shared_data import ROOT
-from uwblink import Contents, Exchanges, Poses
 from uwblink.boards.ports import Terminal
-from uwblink.errors import PortError
 from uwbsim.boards.server import Server
 
 NOISELESS = (ROOT / "scenarios" / "noiseless.toml").read_text()
@@ -42,7 +39,7 @@ def changed(path, poses=None, tags=None, rows=slice(None), anchors=False, **colu
     flight = calib.sample_flight(COUNT, anchors=anchors)
     exchanges = replace(flight.exchanges, **columns)[rows]
     poses, tags = flight.poses if poses is None else poses, flight.tags if tags is None else tags
-    Contents(exchanges=exchanges, poses=poses, tags=tags).save(path)
+    uwblink.Contents(exchanges=exchanges, poses=poses, tags=tags).save(path)
     return path
 
 
@@ -351,7 +348,7 @@ def test_ports_that_are_and_are_not_boards(ports):
 
 def test_a_second_server_does_not_take_the_links_of_the_first(tmp_path):
     first = Terminal(tmp_path / "tag1")
-    with pytest.raises(PortError, match="in use by another server"):
+    with pytest.raises(uwblink.errors.PortError, match="in use by another server"):
         Terminal(tmp_path / "tag1")
     (tmp_path / "tag1").unlink()  # as the error says
     second = Terminal(tmp_path / "tag1")
@@ -391,9 +388,9 @@ def test_a_server_takes_over_the_links_of_a_killed_one(tmp_path, numbered, names
 def test_terminals_of_which_one_cannot_have_its_link_leave_no_other_link(tmp_path):
     record_bench(tmp_path / "r.uwb", duration_s=0.5)
     (tmp_path / "tag2").write_text("mine")
-    with uwblink.Recording.open(tmp_path / "r.uwb") as recording, pytest.raises(PortError, match="tag2"):
+    with uwblink.Recording.open(tmp_path / "r.uwb") as recording, pytest.raises(uwblink.errors.PortError, match="tag2"):
         uwblink.boards.play(recording, lambda names: None, link_dir=tmp_path)
-    with pytest.raises(PortError, match="tag2"):
+    with pytest.raises(uwblink.errors.PortError, match="tag2"):
         Server(bench_scenario(), tmp_path)
     assert [(path.name, path.read_text()) for path in tmp_path.glob("tag*")] == [("tag2", "mine")]
 
@@ -518,7 +515,7 @@ def test_impossible_numbers_in_calibrations_are_refused(seeds, path, value):
         inner = inner[int(key) if isinstance(inner, list) else key]
     inner[int(last) if isinstance(inner, list) else last] = value
     named = path.split("/")[1 if "errors/" in path else 0]
-    with pytest.raises(BadInputError, match=f"(?s)^own.json: .*{named}"):
+    with pytest.raises(calib.BadInputError, match=f"(?s)^own.json: .*{named}"):
         calib.Calibration.from_json(json.dumps(table), "own.json")
     assert calib.Calibration.from_json(text) == calib.load_calibration(seeds / "c.json")
 
@@ -582,8 +579,11 @@ def test_a_twin_does_without_exchanges_of_a_tag_with_itself(tmp_path):
 
 
 def test_empty_recordings_can_be_written_and_read():
-    assert (len(Poses.from_arrays([], [], [])), len(Poses.from_arrays([], "drone", np.zeros((0, 3))))) == (0, 0)
-    assert len(Exchanges.from_arrays([], [], tx1=[], rx1=[], tx2=[], rx2=[])) == 0
+    assert (
+        len(uwblink.Poses.from_arrays([], [], [])),
+        len(uwblink.Poses.from_arrays([], "drone", np.zeros((0, 3)))),
+    ) == (0, 0)
+    assert len(uwblink.Exchanges.from_arrays([], [], tx1=[], rx1=[], tx2=[], rx2=[])) == 0
 
 
 def test_evaluating_ranges_of_the_first_calibrated_tags_only():

@@ -19,7 +19,6 @@ from calib.cli.commands import app as calib_app
 from calib.cli.judging import spread_tests
 from calib.fitting import known_losses
 from tests import processes
-from uwblink import PROTOCOLS
 from uwblink.cli.commands import app as uwblink_app
 from uwblink.exporters import EXPORTERS
 from uwbsim.cli.commands import app as uwbsim_app
@@ -156,7 +155,7 @@ def test_help_lists_the_registered_names():
     }
     for command, option, known in (
         ("calib fit", "loss", known_losses()),
-        ("uwbsim predict", "protocol", PROTOCOLS),
+        ("uwbsim predict", "protocol", uwblink.PROTOCOLS),
         ("uwblink export", "to", EXPORTERS),
     ):
         assert set(parameters[command, option]) == set(known)

@@ -18,7 +18,6 @@ from calib.data.clocks import clocks_apart
 from calib.data.samples import DELAYS_NS, sample_flight
 from calib.data.sources import load_flight, load_ranges
 from calib.evaluation import Settings
-from uwblink.errors import ArgumentError, ImportTableError, RecordingError
 from uwblink.recording.contents import exchanges_with_poses
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 
@@ -198,7 +197,7 @@ def test_poses_without_time_or_body_are_refused(tmp_path):
         place = written(tmp_path / f"{column}.uwb", flight, {})
         with duckdb.connect(str(place)) as db:
             db.execute(f"UPDATE poses SET {column} = NULL WHERE body = ?", [flight.tags[0].body])
-        with pytest.raises(RecordingError, match="table poses"):
+        with pytest.raises(uwblink.errors.RecordingError, match="table poses"):
             load_ranges(place)
 
 
@@ -345,12 +344,12 @@ def test_wrong_types_of_arrays_are_named_by_column(columns, said):
         ),
         (
             lambda folder: uwblink.import_recording(frame(), folder / "t.uwb", map_file={"columns": {"nonsense": "a"}}),
-            ImportTableError,
+            uwblink.errors.ImportTableError,
             r"^data frame: columns\.nonsense",
         ),
         (
             lambda folder: uwblink.import_recording(folder / "t.csv", folder / "t.uwb", map_file=MAP),
-            ArgumentError,
+            uwblink.errors.ArgumentError,
             "map_file",
         ),
     ],
@@ -401,7 +400,7 @@ def test_without_pandas_the_error_names_the_package_to_install(monkeypatch):
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", missing)
-    with pytest.raises(ArgumentError, match="pip install pandas"):
+    with pytest.raises(uwblink.errors.ArgumentError, match="pip install pandas"):
         calib.load_ranges(calib.sample_flight()).to_pandas()
 
 

@@ -12,11 +12,9 @@ import uwblink
 from benchmarks.hours import RATE_HZ, AnsweringPorts
 from tests.boards import bench_scenario, record_bench
 from tests.processes import wait_until
-from uwblink import Listener, RangingPlan, Recording
 from uwblink.boards import record as writing
 from uwblink.boards.record import RecordingWriter, append_rows, identify
 from uwblink.boards.recorder import Recorder
-from uwblink.errors import RecordingError
 from uwblink.recording.schema import FrameRow
 from uwblink.recording.store import Store
 from uwblink.wire import RangeReport
@@ -97,7 +95,7 @@ def test_one_damaged_line_is_one_fault(tmp_path):
 
 @pytest.fixture
 def live(tmp_path):
-    with Recording.create(tmp_path / "live.uwb", live=True) as recording:
+    with uwblink.Recording.create(tmp_path / "live.uwb", live=True) as recording:
         yield recording
 
 
@@ -117,7 +115,7 @@ def test_rows_are_committed_while_a_long_log_is_put_into_the_file(live, monkeypa
         begun.set()
         over.wait(60)
 
-    monkeypatch.setattr(Recording, "shorten_log", shorten_log)
+    monkeypatch.setattr(uwblink.Recording, "shorten_log", shorten_log)
     log, written = Path(f"{live.path}.wal"), []
     with RecordingWriter(live) as writer:
         writer.on_bytes(1, "port", "in", bytes(30_000))
@@ -141,21 +139,23 @@ def test_a_log_stays_short_and_everything_is_in_the_file(live, monkeypatch):
     assert [frame.data for frame in live.frames()] == [bytes(range(256)) * 100, b"later"]
 
 
-@pytest.mark.parametrize("error", [MemoryError("no more"), RuntimeError("a bug"), RecordingError("disk full")])
+@pytest.mark.parametrize(
+    "error", [MemoryError("no more"), RuntimeError("a bug"), uwblink.errors.RecordingError("disk full")]
+)
 def test_failures_of_writing_are_reported_within_a_second(live, monkeypatch, error):
     writer = RecordingWriter(live)
 
     def failing(_recording, _table, _rows):
         raise error
 
-    monkeypatch.setattr(Recording, "append", failing)
+    monkeypatch.setattr(uwblink.Recording, "append", failing)
     writer.on_bytes(5, "port", "in", b"x")
     begun = time.monotonic()
-    with pytest.raises(RecordingError, match=str(error)):
+    with pytest.raises(uwblink.errors.RecordingError, match=str(error)):
         while time.monotonic() < begun + 10.0:  # ten, because of other load; it takes one period of the writer
             writer.check()
             time.sleep(0.01)
-    with pytest.raises(RecordingError, match=str(error)):
+    with pytest.raises(uwblink.errors.RecordingError, match=str(error)):
         writer.close()
 
 
@@ -166,7 +166,7 @@ WARM, LATER, LONG = 1_100, 2_300, 2_400
 EVERY = 100
 
 
-class Committing(Listener):
+class Committing(uwblink.Listener):
     """Commits after every few exchanges, in the loop itself, and stores the statements of each commit."""
 
     def __init__(self, recording, every=EVERY):
@@ -212,10 +212,10 @@ def statements(monkeypatch):
 @pytest.mark.slow
 def test_nothing_grows_with_the_recording(tmp_path, statements):
     ports, held = AnsweringPorts(), {}
-    with Recording.create(tmp_path / "long.uwb", live=True) as recording:
+    with uwblink.Recording.create(tmp_path / "long.uwb", live=True) as recording:
         committing = Committing(recording)
         found = identify(ports.names, ports)
-        plan = RangingPlan(ports.pairs[:1], rate_hz=RATE_HZ)
+        plan = uwblink.RangingPlan(ports.pairs[:1], rate_hz=RATE_HZ)
         recorder = Recorder(found, plan, plan.turns(sorted(found)), [committing], ports=ports)
         for _ in recorder.steps(stop=lambda: committing.exchanges >= LONG):
             if committing.exchanges in (WARM, LATER) and committing.exchanges not in held:

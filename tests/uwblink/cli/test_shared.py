@@ -18,7 +18,6 @@ from tests.shared_data import ROOT
 from uwblink.cli import shared
 from uwblink.cli.commands import app
 from uwblink.cli.shared import waiting
-from uwblink.errors import PluginWarning, RecordingError
 
 
 class MineError(Exception):
@@ -40,7 +39,11 @@ def run_as_command(work, *errors, **how):
     ("error", "code", "line"),
     [
         (None, 0, ""),
-        (RecordingError("f.uwb: exists; or `force` and `map_file`"), 2, "error: f.uwb: exists; or --force and --map\n"),
+        (
+            uwblink.errors.RecordingError("f.uwb: exists; or `force` and `map_file`"),
+            2,
+            "error: f.uwb: exists; or --force and --map\n",
+        ),
         (MineError("mine"), 2, "error: mine\n"),
         (WorseError("worse"), 1, "error: worse\n"),
         (MineError("a\nb\x1b[31m \ud800"), 2, "error: a\\nb\\x1b[31m \\ud800\n"),
@@ -81,7 +84,7 @@ def test_unexpected_errors_are_raised():
 def test_only_warnings_of_plug_ins_become_lines(capsys):
     def warn() -> None:
         warnings.simplefilter("always")
-        warnings.warn("left out", PluginWarning, stacklevel=1)
+        warnings.warn("left out", uwblink.errors.PluginWarning, stacklevel=1)
         warnings.warn("other", UserWarning, stacklevel=1)
 
     with pytest.warns(UserWarning, match="other") as caught, pytest.raises(SystemExit):

@@ -134,17 +134,24 @@ def test_files_in_use_are_named(recording, held):
         assert r.count("exchanges") == 50
 
 
-def test_a_damaged_file_with_the_word_lock_in_its_path_is_damaged(recording, tmp_path):
-    (tmp_path / "blocks.uwb").write_bytes(b"\0" * recording.stat().st_size)
-    with pytest.raises(RecordingError, match=r"not a \.uwb recording, or a truncated one"):
-        Recording.open(tmp_path / "blocks.uwb")
+SIZE = 3 * 4096 + 16384
+"""Of a database."""
 
 
-@pytest.mark.parametrize(("name", "command"), [("t.csv", "csv"), ("t.csv.gz", "csv"), ("t.MCAP", "bag")])
-@pytest.mark.parametrize("size", [100, 3 * 4096 + 16384])  # an odd number of bytes, and the size of a database
-def test_errors_for_tables_name_the_import(tmp_path, name, command, size):
-    (tmp_path / name).write_bytes(b"a" * size)
-    with pytest.raises(RecordingError, match=f"{name}: is not a recording; convert it with `uwblink import {command}`"):
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("blocks.uwb", bytes(SIZE), r"not a \.uwb recording, or a truncated one"),  # though its path has the word lock
+        *(
+            (name, b"a" * size, f"{name}: is not a recording; convert it with `uwblink import {command}`")
+            for name, command in (("t.csv", "csv"), ("t.csv.gz", "csv"), ("t.MCAP", "bag"))
+            for size in (100, SIZE)
+        ),
+    ],
+)
+def test_damaged_files_are_called_damaged_and_errors_for_tables_name_the_import(tmp_path, name, content, said):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(RecordingError, match=said):
         Recording.open(tmp_path / name)
 
 

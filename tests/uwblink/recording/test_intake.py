@@ -132,12 +132,6 @@ def test_more_rows_than_a_file_can_hold_are_not_read(file, monkeypatch):
         Recording.open(file)
 
 
-def test_meta_is_bounded_in_bytes(file):
-    change(file, f"INSERT INTO meta SELECT 'big', repeat('9', {store.MOST_META_BYTES})")
-    with pytest.raises(RecordingError, match=r"table meta holds 64\d+ bytes, at most 64000000"):
-        Recording.open(file)
-
-
 @pytest.mark.parametrize(
     ("value", "expected"),
     [
@@ -147,9 +141,10 @@ def test_meta_is_bounded_in_bytes(file):
         ("'[1, -1e400]'", "that of x"),
         (f"'{'[' * 100_000}'", "that of x"),
         ("'{'", "that of x"),
+        (f"repeat('9', {store.MOST_META_BYTES})", r"table meta holds 64\d+ bytes, at most 64000000"),
     ],
 )
-def test_wrong_json_in_meta_is_refused(file, value, expected):
+def test_wrong_json_and_too_many_bytes_in_meta_are_refused(file, value, expected):
     change(file, f"INSERT INTO meta VALUES ('x', {value})")
     with pytest.raises(RecordingError, match=expected) as caught:
         Recording.open(file)
@@ -157,23 +152,30 @@ def test_wrong_json_in_meta_is_refused(file, value, expected):
 
 
 @pytest.mark.parametrize(
-    ("table", "row"),
-    [("tags", "2, NULL, 0, 0, 0"), ("cirs", "9, 1, 1, 2, NULL, NULL"), ("faults", "9, NULL, 'power', '', NULL, 3")],
+    ("table", "statement", "said"),
+    [
+        *(
+            (table, f"INSERT INTO {table} VALUES ({row})", f"table {table}: a row with nothing")
+            for table, row in (
+                ("tags", "2, NULL, 0, 0, 0"),
+                ("cirs", "9, 1, 1, 2, NULL, NULL"),
+                ("faults", "9, NULL, 'power', '', NULL, 3"),
+            )
+        ),
+        *(
+            (
+                "exchanges",
+                f"UPDATE meta SET value = '{json.dumps(bits)}' WHERE key = 'timestamp_bits'",
+                r"timestamp_bits is .*expected 32 or 40",
+            )
+            for bits in (0, -1, 33, 64, 10**30, True, None, "32", [32], 32.5)
+        ),
+    ],
 )
-def test_rows_with_missing_values_are_refused(file, table, row):
-    change(file, f"INSERT INTO {table} VALUES ({row})")
-    with Recording.open(file) as recording, pytest.raises(RecordingError, match=f"table {table}: a row with nothing"):
+def test_missing_values_and_wrong_widths_of_stamps_are_refused_when_they_are_read(file, table, statement, said):
+    change(file, statement)
+    with Recording.open(file) as recording, pytest.raises(RecordingError, match=said):
         getattr(recording, table)()
-
-
-@pytest.mark.parametrize("bits", [0, -1, 33, 64, 10**30, True, None, "32", [32], 32.5])
-def test_wrong_widths_of_stamps_are_refused(file, bits):
-    change(file, f"UPDATE meta SET value = '{json.dumps(bits)}' WHERE key = 'timestamp_bits'")
-    with (
-        Recording.open(file) as recording,
-        pytest.raises(RecordingError, match=r"timestamp_bits is .*expected 32 or 40"),
-    ):
-        recording.exchanges()
 
 
 def test_endless_reads_are_interrupted(file):
