@@ -301,10 +301,6 @@ def test_mistakes_are_named_and_nothing_is_written(seeds, tmp_path, line, naming
     refused(seeds, tmp_path, line, naming, text)
 
 
-def test_every_change_of_a_scenario_finds_its_place():
-    assert [old for old, _, _ in SCENARIOS if old not in NOISELESS] == []
-
-
 @pytest.fixture(scope="module")
 def ports():
     with served() as server:
@@ -451,6 +447,7 @@ FIT = "calib fit {here}/bad.uwb -o c.json"
         ({"rx2": SAMPLE.rx2 + 2**30 & 2**32 - 1}, FIT, ["bad.uwb", "none of its", "no range within 10 km"]),
         ({"poses": LATE}, FIT, ["poses cover 0.0 to 11.0 s", "exchanges -99.0 to -90.0 s", "--offset"]),
         ({"poses": POSES[:0]}, FIT, ["bad.uwb", "no true distance"]),
+        ({"tags": []}, FIT, ["it has no tags with bodies and lever arms", "--tags"]),
         ({"poses": replace(POSES, position_m=POSES.position_m * 1000)}, FIT, ["bad.uwb", "millimetres"]),
         ({"fpp1_dbm": -SAMPLE.fpp1_dbm, "fpp2_dbm": -SAMPLE.fpp2_dbm}, FIT, ["bad.uwb", "dBm"]),
         (
@@ -481,43 +478,6 @@ def test_poses_of_a_part_of_the_flight_are_enough_for_a_warning(tmp_path):
     cut = changed(tmp_path / "cut.uwb", poses=POSES[POSES.time_ns < 64 * 10**8])
     done = succeed("calib", "fit", cut, "-o", tmp_path / "c.json")
     assert "40 % of the exchanges were left out: no true distance" in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        ("speed_of_light", 0),
-        ("speed_of_light", 3e5),
-        ("delays_std_ns/2", -0.05),
-        ("delays_ns/2", 9.2e18),
-        ("delays_ns/2", 10**400),
-        ("delays_ns/2", None),
-        ("delays_ns/" + "9" * 5000, 0.1),
-        ("delays_std_ns/2", 9.2e18),
-        ("scale_ns", -1.0),
-        ("alpha_dbm", 4000.0),
-        ("bias_curve/coefficients/0", 1e30),
-        ("sigma_curve/coefficients/0", -0.5),
-        ("errors/outlier_share", 1.5),
-        ("errors/outlier_m", -3.0),
-        ("errors/scale", 0.0),
-        ("errors/detour_m", -0.1),
-        ("errors/levels/0/0", 2.0),
-        ("uncertainty/delays_ns2/0/0", -0.01),
-        ("uncertainty/bias_m2", [[1.0]]),
-    ],
-)
-def test_impossible_numbers_in_calibrations_are_refused(seeds, path, value):
-    text = (seeds / "c.json").read_text()
-    table = inner = json.loads(text)
-    *outer, last = path.split("/")
-    for key in outer:
-        inner = inner[int(key) if isinstance(inner, list) else key]
-    inner[int(last) if isinstance(inner, list) else last] = value
-    named = path.split("/")[1 if "errors/" in path else 0]
-    with pytest.raises(calib.BadInputError, match=f"(?s)^own.json: .*{named}"):
-        calib.Calibration.from_json(json.dumps(table), "own.json")
-    assert calib.Calibration.from_json(text) == calib.load_calibration(seeds / "c.json")
 
 
 def test_a_calibration_without_a_tag_of_the_recording_is_refused(seeds, tmp_path):

@@ -305,24 +305,46 @@ def test_error_models_are_read_unchanged_and_may_be_missing(error_fitted):
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "said"),
+    ("path", "value", "said"),
     [
-        ("lifted", [0.1], "errors: lifted"),
-        ("noise_m", [0.0] * 8, "errors: noise_m: 0: .*above 0"),
-        ("noise_m", [1.0] * 7, "errors: lifted"),
-        ("tail_share", [1.5] * 8, "errors: tail_share: 0"),
-        ("pairs", {"one-two": {}}, "names of pairs"),
-        ("pairs", {"1-2": {"noise": 1.0, "odds": 0.0, "detour": 1.0}}, "1-2: odds"),
-        ("levels", [[0.1]], "levels"),
-        ("scale", "wide", "scale"),
-        ("long_share", 1.5, "long_share"),
+        ("speed_of_light", 0, "speed_of_light"),
+        ("speed_of_light", 3e5, "speed_of_light"),
+        ("delays_ns/2", 9.2e18, "delays_ns"),
+        ("delays_ns/2", 10**400, "delays_ns"),
+        ("delays_ns/2", None, "delays_ns"),
+        ("delays_ns/" + "9" * 5000, 0.1, "delays_ns"),
+        ("delays_std_ns/2", -0.05, "delays_std_ns"),
+        ("delays_std_ns/2", 9.2e18, "delays_std_ns"),
+        ("scale_ns", -1.0, "scale_ns"),
+        ("alpha_dbm", 4000.0, "alpha_dbm"),
+        ("bias_curve/coefficients/0", 1e30, "bias_curve"),
+        ("sigma_curve/coefficients/0", -0.5, "sigma_curve"),
+        ("errors/lifted", [0.1], "errors: lifted"),
+        ("errors/noise_m", [0.0] * 8, "errors: noise_m: 0: .*above 0"),
+        ("errors/noise_m", [1.0] * 7, "errors: lifted"),
+        ("errors/tail_share", [1.5] * 8, "errors: tail_share: 0"),
+        ("errors/pairs", {"one-two": {}}, "names of pairs"),
+        ("errors/pairs", {"1-2": {"noise": 1.0, "odds": 0.0, "detour": 1.0}}, "1-2: odds"),
+        ("errors/levels", [[0.1]], "levels"),
+        ("errors/levels/0/0", 2.0, "levels"),
+        ("errors/scale", "wide", "scale"),
+        ("errors/scale", 0.0, "scale"),
+        ("errors/outlier_share", 1.5, "outlier_share"),
+        ("errors/outlier_m", -3.0, "outlier_m"),
+        ("errors/detour_m", -0.1, "detour_m"),
+        ("errors/long_share", 1.5, "long_share"),
+        ("uncertainty/delays_ns2/0/0", -0.01, "uncertainty"),
+        ("uncertainty/bias_m2", [[1.0]], "uncertainty"),
     ],
 )
-def test_a_damaged_model_is_one_clear_error(error_fitted, key, value, said):
-    document = json.loads(error_fitted.to_json())
-    document["errors"][key] = value
-    with pytest.raises(calib.BadInputError, match=said):
-        Calibration.from_json(json.dumps(document), "here")
+def test_impossible_values_in_files_are_refused_by_name(error_fitted, path, value, said):
+    table = inner = json.loads(error_fitted.to_json())
+    *outer, last = path.split("/")
+    for key in outer:
+        inner = inner[int(key) if isinstance(inner, list) else key]
+    inner[int(last) if isinstance(inner, list) else last] = value
+    with pytest.raises(calib.BadInputError, match=f"(?s)^here: .*{said}"):
+        Calibration.from_json(json.dumps(table), "here")
 
 
 def test_a_fit_estimates_the_persistence_of_errors():

@@ -1,50 +1,21 @@
 """The command line names options instead of parameters, and derives the options of a fit from its settings."""
 
 import json
-import re
 from dataclasses import fields
-from typing import Any
 
 import numpy as np
 import pytest
-import typer
 
 import calib
 from calib.calibration.power_curves import ALPHA_DBM, LIFTS
-from calib.cli.commands import app
 from calib.cli.shared import with_flags
 from calib.estimator import optimize
 from calib.settings import FitSettings, read_distances
-from docs.site.commands import leaves
 from tests import processes
 from tests.calib.plain_tables import DELAYS_NS, Plan, bias_m, write
 from tests.calib.trajectories.sines import flight
 from tests.processes import succeed as run
-from tests.shared_data import ROOT
 from uwblink import Contents, KnownDistance, Recording
-
-COMMANDS: Any = typer.main.get_command(app)
-OPTIONS = {o for _, command in leaves(COMMANDS, ("calib",)) for parameter in command.params for o in parameter.opts}
-# Without an option: the power of the lifting, equal for all calibrations, and parameters of functions only.
-ONLY_FROM_PYTHON = {
-    *("alpha_dbm", "data", "truth_m", "range_m", "target", "weights", "protocol", "name", "before", "section"),
-    *("shares", "start_m", "information", "loosest", "boards", "robots"),
-    # Named by the command itself, as its own option.
-    *("seconds", "speed_m_s", "apart_m", "still_s", "noise_m", "size_m", "rate_hz", "tape_sigma_m", "anchor_sigma_m"),
-    *("anchor_places", "reference"),
-    # Parts of the errors of ranges and of differences of arrival.
-    *("side", "odds"),
-    # Parameters of ranges from arrays.
-    *("features", "temperature_c"),
-}
-
-
-def test_parameters_in_errors_have_options():
-    named = set()
-    for path in (ROOT / "calib").rglob("*.py"):
-        named |= set(re.findall(r'(?:parameter=|check_choice\()"([a-z_0-9]+)"', path.read_text()))
-    assert {"fixed_ns", "groups", "loss", "tag", "to"} <= named
-    assert {with_flags(f"`{name}`") for name in named - ONLY_FROM_PYTHON} <= OPTIONS
 
 
 def test_other_text_is_not_changed():

@@ -163,6 +163,7 @@ def test_the_band_of_the_curve_includes_the_uncertain_smoothness(monkeypatch):
         ("scale_ns", math.nan),
         ("scale_ns", "auto"),
         ("lift", "up"),
+        ("between_m", -1.0),
         ("constants", "board"),
         ("alpha_dbm", math.inf),
         ("fixed_ns", {1: math.nan}),

@@ -12,9 +12,9 @@ import pytest
 
 from tests.boards import bench_scenario, record_bench, served
 from tests.processes import BIN, wait_until
-from uwblink import Arrangement, Listener, RangingPlan, Recording, Tag, load, raw_range, record
+from uwblink import Listener, RangingPlan, Recording, Tag, load, raw_range, record
 from uwblink.boards import Progress, decode_again
-from uwblink.errors import PlanError, PortMissingError, RecordingError, RecordingExistsError
+from uwblink.errors import PlanError, PortMissingError, RecordingExistsError
 from uwblink.recording.schema import FrameRow
 from uwblink.wire.messages import IdReport, Skipped
 from uwbsim import VirtualPorts
@@ -62,14 +62,6 @@ def test_impossible_arrangements_plans_listeners_and_durations_are_refused(tmp_p
 
 def test_a_plan_with_the_position_of_one_of_the_boards_is_recorded(tmp_path):
     assert record_bench(tmp_path / "a.uwb", places_of(1), duration_s=0.2).exchanges
-
-
-@pytest.mark.parametrize("known", ["line 1 1", "plane 1 2", "line 1 b", "line  1"])
-def test_wrong_orders_are_one_line(tmp_path, known):
-    with Recording.create(tmp_path / "a.uwb", meta={}) as recording:
-        recording.append("arrangements", [Arrangement("A", 0, 1, known)])
-        with pytest.raises(RecordingError, match="known: found"):
-            recording.arrangements()
 
 
 def test_bytes_of_boards_are_in_the_file_and_decode_to_its_exchanges(tmp_path):

@@ -163,6 +163,10 @@ def test_wrong_json_and_too_many_bytes_in_meta_are_refused(file, value, expected
             )
         ),
         *(
+            ("arrangements", f"INSERT INTO arrangements VALUES (0, 1, 'A', '{known}')", "known: found")
+            for known in ("line 1 1", "plane 1 2", "line 1 b", "line  1")
+        ),
+        *(
             (
                 "exchanges",
                 f"UPDATE meta SET value = '{json.dumps(bits)}' WHERE key = 'timestamp_bits'",
@@ -172,7 +176,7 @@ def test_wrong_json_and_too_many_bytes_in_meta_are_refused(file, value, expected
         ),
     ],
 )
-def test_missing_values_and_wrong_widths_of_stamps_are_refused_when_they_are_read(file, table, statement, said):
+def test_missing_values_wrong_orders_and_widths_of_stamps_are_refused_when_they_are_read(file, table, statement, said):
     change(file, statement)
     with Recording.open(file) as recording, pytest.raises(RecordingError, match=said):
         getattr(recording, table)()

@@ -421,12 +421,6 @@ def test_fields_are_declared_once_and_frozen():
         encode(Weather(300, "x", 0.0, b""))
 
 
-@pytest.mark.parametrize("key", [b"X01", b"R1", b"R123", "R42", None])
-def test_keys_are_a_letter_and_two_digits(key):
-    with pytest.raises(ArgumentError, match=r"key: found .*, expected a letter C, R or S and two digits"):
-        message(key)
-
-
 @message(b"R43")
 class Half(Message):
     """One field has no kind."""
@@ -443,17 +437,19 @@ class Another(Message):
 
 
 @pytest.mark.parametrize(
-    ("kind", "expected"),
+    ("make", "given", "expected"),
     [
-        (Weather, r"message Weather \(R42\): R42 is Weather already; choose another key"),
-        (Another, r"message Another \(R05\): R05 is RangeReport already"),
-        (Half, r"message Half \(R43\): rest: has no kind; declare it as in `count: int = wire\(INT\)`"),
-        (Message, "expected a class made with @message"),
-        (int, "expected a class made with @message"),
-        (SAMPLE, "expected a class made with @message"),
+        *(
+            (message, key, "key: found .*, expected a letter C, R or S and two digits")
+            for key in (b"X01", b"R1", b"R123", "R42", None)
+        ),
+        (register_message, Weather, r"message Weather \(R42\): R42 is Weather already; choose another key"),
+        (register_message, Another, r"message Another \(R05\): R05 is RangeReport already"),
+        (register_message, Half, r"Half \(R43\): rest: has no kind; declare it as in `count: int = wire\(INT\)`"),
+        *((register_message, other, "expected a class made with @message") for other in (Message, int, SAMPLE)),
     ],
 )
-def test_wrong_messages_are_refused(kind, expected):
+def test_wrong_keys_and_messages_are_refused(make, given, expected):
     with pytest.raises(ArgumentError, match=expected):
-        register_message(kind)
+        make(given)
     assert REPORTS[b"R05"] is RangeReport
