@@ -447,6 +447,7 @@ FIT = "calib fit {here}/bad.uwb -o c.json"
         ({"rx2": SAMPLE.rx2 + 2**30 & 2**32 - 1}, FIT, ["bad.uwb", "none of its", "no range within 10 km"]),
         ({"poses": LATE}, FIT, ["poses cover 0.0 to 11.0 s", "exchanges -99.0 to -90.0 s", "--offset"]),
         ({"poses": POSES[:0]}, FIT, ["bad.uwb", "no true distance"]),
+        ({"rows": slice(60)}, FIT, ["too few"]),
         ({"tags": []}, FIT, ["it has no tags with bodies and lever arms", "--tags"]),
         ({"poses": replace(POSES, position_m=POSES.position_m * 1000)}, FIT, ["bad.uwb", "millimetres"]),
         ({"fpp1_dbm": -SAMPLE.fpp1_dbm, "fpp2_dbm": -SAMPLE.fpp2_dbm}, FIT, ["bad.uwb", "dBm"]),

@@ -122,8 +122,10 @@ def backwards(t):
 
 
 @pytest.mark.parametrize(
-    ("change", "expected"),
+    ("protocol", "expected"),
     [
+        ("ds", "found 'ds', expected a RangingProtocol"),
+        *((replace(SYMMETRIC, **change), expected) for change, expected in (
         ({"name": "two words"}, r"name: found 'two words', expected a word such as 'ds-alt'"),
         ({"name": ""}, "name: found ''"),
         ({"title": ""}, "title: found ''"),
@@ -143,17 +145,13 @@ def backwards(t):
         ({"flight_ticks": collapsed}, r"return shapes \(\) and \(\(2,\), \(2,\)\) for two exchanges"),
         ({"flight_ticks": failing}, r"fail on an exchange without noise: KeyError\('dt99'\)"),
         ({"delay_weights": backwards}, "delay_weights leave 936 ticks .* antenna delays of 64 and 0"),
+        )),
     ],
 )  # fmt: skip
-def test_wrong_protocols_are_refused_in_one_line(change, expected):
+def test_wrong_protocols_are_refused_in_one_line(protocol, expected):
     with pytest.raises(ArgumentError, match=rf"\A.*({expected}).*\Z"):
-        register_protocol(replace(SYMMETRIC, **change))
+        register_protocol(protocol)
     assert SYMMETRIC.name not in PROTOCOLS
-
-
-def test_other_objects_than_protocols_are_refused():
-    with pytest.raises(ArgumentError, match="found 'ds', expected a RangingProtocol"):
-        register_protocol("ds")  # type: ignore[arg-type]
 
 
 def test_ranges_of_known_protocols_look_for_no_plug_ins(monkeypatch):

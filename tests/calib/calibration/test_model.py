@@ -93,9 +93,33 @@ def test_factors_of_a_pair_hold_in_both_directions(fitted, name):
     assert there / (1 - there) == pytest.approx(3 * other / (1 - other))
 
 
-def test_a_tag_in_no_group_is_named(fitted):
-    with pytest.raises(calib.BadInputError, match="tag 7 is in none"):
-        replace(fitted, groups={"a": TagGroup((1, 2, 3), fitted.bias_curve, fitted.sigma_curve)}).apply(ranges(10))
+def of_three(known):
+    """Return a calibration with a group without tag 7."""
+    return replace(known, groups={"a": TagGroup((1, 2, 3), known.bias_curve, known.sigma_curve)})
+
+
+@pytest.mark.parametrize(
+    ("use", "error", "said"),
+    [
+        (lambda known: of_three(known).apply(ranges(10)), calib.BadInputError, "tag 7 is in none"),
+        (
+            lambda known: calib.compare(known, replace(known, delays_ns={99: 0.0})),
+            calib.UnanswerableError,
+            "0 tags have determined delays in both",
+        ),
+        *(
+            (
+                lambda known, shares=shares: known.quantiles(ranges(10), shares),
+                calib.BadInputError,
+                r"`shares`: .*between 0 and 1",
+            )
+            for shares in ([], [0.0], [1.2], [[0.5]])
+        ),
+    ],
+)
+def test_what_a_calibration_cannot_be_used_for_is_named(fitted, use, error, said):
+    with pytest.raises(error, match=said):
+        use(fitted)
 
 
 SLOPE = '{"tags": [%d], "m_per_k": 0.002, "std_m_per_k": 0.0, "reference_c": 25.0, "span_c": [20, 30]}'
@@ -377,12 +401,6 @@ def test_a_fit_estimates_the_duration_of_reflections(renewal_s):
     assert found == pytest.approx(renewal_s, rel=0.4, abs=0.03)
 
 
-@pytest.mark.parametrize("shares", [[], [0.0], [1.2], [[0.5]]])
-def test_quantiles_refuse_wrong_shares(error_fitted, shares):
-    with pytest.raises(calib.BadInputError, match=r"`shares`: .*between 0 and 1"):
-        error_fitted.quantiles(calib.load_ranges(calib.sample_flight()), shares)
-
-
 # Comparison of two calibrations.
 
 
@@ -413,11 +431,6 @@ def test_a_common_shift_of_delays_and_curve_is_no_difference(fitted):
     assert found.same
     assert [found.offset_m, found.curve_rms_m] == pytest.approx([0, 0], abs=1e-9)
     assert np.abs(list(found.difference_ns.values())).max() < 1e-9
-
-
-def test_calibrations_without_common_tags_are_not_compared(fitted):
-    with pytest.raises(calib.UnanswerableError, match="0 tags have determined delays in both"):
-        calib.compare(fitted, replace(fitted, delays_ns={99: 0.0}))
 
 
 @pytest.mark.slow
