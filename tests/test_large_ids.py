@@ -8,7 +8,6 @@ import pytest
 
 import calib
 import uwblink
-from calib.surveys.knowledge import load_knowledge
 from tests.processes import ROOT, refuse, succeed
 
 LARGEST = 65535
@@ -60,12 +59,3 @@ def test_large_ids_work_for_other_boards_only(folder):
     with pytest.raises(uwblink.errors.PlanError, match="pairs"):
         uwblink.RangingPlan(pairs=((1, 255),))
     assert uwblink.RangingPlan(pairs=((1, 254),)).pairs == ((1, 254),)
-
-
-def test_large_ids_work_in_known_facts(tmp_path):
-    (tmp_path / "known.toml").write_text(
-        f"[[distances]]\nbetween = [{LARGEST}, 300]\ndistance_m = 3.0\n"
-        f"[[positions]]\ntag = {LARGEST}\nposition_m = [0.0, 0.0, 0.0]\n"
-    )
-    known = load_knowledge(tmp_path / "known.toml")
-    assert {known.distances[0].first, known.distances[0].second} == {LARGEST, 300}

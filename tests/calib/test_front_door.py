@@ -196,8 +196,3 @@ def test_undetermined_delays_are_drawn_as_circles(fitted):
 def test_planted_delays_are_drawn_moved_by_the_common_shift(fitted):
     axes = axes_of(lambda axes: delays(fitted.calibration, {1: 0.1, 2: -0.2, 3: 0.0, 7: 0.3}, 0.05, axes))
     assert labelled(axes, "planted, same gauge").get_ydata() == pytest.approx([0.15, -0.15, 0.05, 0.35])
-
-
-def test_dictionaries_are_not_lists_of_paths():
-    with pytest.raises(calib.BadInputError, match="`data`: found dict, expected a path"):
-        calib.fit({"range_m": [3.1], "initiator": [1], "target": [2]})

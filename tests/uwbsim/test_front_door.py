@@ -27,21 +27,6 @@ def test_a_scenario_is_a_file_a_text_tables_or_itself():
     assert uwbsim.load(str(NOISELESS), SHORT) == uwbsim.load(NOISELESS, ["run.duration_s=2.0"]) == loaded
 
 
-@pytest.mark.parametrize(
-    ("source", "overrides", "message"),
-    [
-        ("run = {\n", (), r"^scenario: not valid TOML"),
-        ({"ranging": {"rate_hz": 1.0}}, (), r"^scenario: run: missing"),
-        ("nowhere.toml", (), r"nowhere\.toml: no such scenario file"),
-        (NOISELESS, ["run"], r"^`overrides`: found 'run' *, expected key"),
-        (NOISELESS, {"run.seed.x": 1}, r"^run\.seed\.x: seed is not a table"),
-    ],
-)
-def test_errors_in_scenarios_name_the_place(source, overrides, message):
-    with pytest.raises(uwbsim.ScenarioError, match=message):
-        uwbsim.simulate(uwbsim.load(source, overrides))
-
-
 def test_a_notebook_shows_the_tags_of_a_scenario():
     scenario = uwbsim.load(NOISELESS, {"tags.1.skew_ppm": 1.5, "run.name": "<b>"})
     page = scenario._repr_html_()

@@ -10,12 +10,9 @@ from tests import processes
 
 
 @pytest.fixture(scope="module")
-def surveyed(tmp_path_factory):
-    """Return a recording and the document of a survey of its tags."""
-    folder = tmp_path_factory.mktemp("surveyed")
-    processes.succeed("calib", "sample", "-o", folder / "a.uwb", "-n", "900")
-    found = calib.survey(calib.sample_arrangements(), known="line").calibration
-    return folder / "a.uwb", json.loads(found.to_json())
+def document():
+    """The document of a survey of the tags of the sample."""
+    return json.loads(calib.survey(calib.sample_arrangements(), known="line").calibration.to_json())
 
 
 @pytest.mark.parametrize(
@@ -35,8 +32,8 @@ def surveyed(tmp_path_factory):
     ],
     ids=str,
 )
-def test_a_damaged_entry_is_one_line_where_it_is_used(surveyed, tmp_path, entry, value):
-    recording, document = surveyed
+def test_a_damaged_entry_is_one_line_where_it_is_used(document, tmp_path, entry, value):
+    processes.succeed("calib", "sample", "-o", tmp_path / "a.uwb", "-n", "900")
     changed = json.loads(json.dumps(document))
     table = changed["provenance"]
     for key in entry[:-1]:
@@ -44,7 +41,7 @@ def test_a_damaged_entry_is_one_line_where_it_is_used(surveyed, tmp_path, entry,
     table[entry[-1]] = value
     (tmp_path / "c.json").write_text(json.dumps(changed))
     page = tmp_path / "r.html"
-    judged = processes.run("calib", "evaluate", recording, "-c", tmp_path / "c.json", "--report", page)
+    judged = processes.run("calib", "evaluate", tmp_path / "a.uwb", "-c", tmp_path / "c.json", "--report", page)
     shown = processes.run("calib", "show", tmp_path / "c.json")
     for done in (judged, shown):
         assert "Traceback" not in done.stderr
@@ -54,8 +51,7 @@ def test_a_damaged_entry_is_one_line_where_it_is_used(surveyed, tmp_path, entry,
     assert page.exists() == (judged.returncode == 0)
 
 
-def test_calibrations_of_version_0_2_are_read_by_the_old_names_of_keys(surveyed):
-    _, document = surveyed
+def test_calibrations_of_version_0_2_are_read_by_the_old_names_of_keys(document):
     older = {"geometry": "rests_on", "undetermined_text": "left_open"}
     provenance = {older.get(key, key): value for key, value in document["provenance"].items()}
     assert "rests_on" in provenance
@@ -63,8 +59,7 @@ def test_calibrations_of_version_0_2_are_read_by_the_old_names_of_keys(surveyed)
     assert known == calib.Calibration.from_json(json.dumps(document))
 
 
-def test_flat_curves_are_shown_at_one_power(surveyed):
-    _, document = surveyed
+def test_flat_curves_are_shown_at_one_power(document):
     text = repr(calib.Calibration.from_json(json.dumps(document)))
     (line,) = [line for line in text.splitlines() if line.startswith("  lifted power")]
     assert len(line.removeprefix("  lifted power").split()) == 1

@@ -97,9 +97,18 @@ def test_exchanges_with_their_distances_need_no_poses():
         load_ranges(flight.exchanges)
 
 
-@pytest.mark.parametrize("data", [None, 3, [], [None], {"a": 1}])
-def test_other_objects_than_recordings_are_refused(data):
-    with pytest.raises((calib.BadInputError, FileNotFoundError)):
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (None, "found NoneType, expected a path"),
+        (3, "found int, expected a path"),
+        ([], "no recording was given"),
+        ([None], "found NoneType, expected a path"),
+        ({"range_m": [3.1]}, "found dict, expected a path"),
+    ],
+)
+def test_other_objects_than_recordings_are_refused(data, said):
+    with pytest.raises(calib.BadInputError, match=f"`data`: {said}"):
         load_ranges(data)
 
 

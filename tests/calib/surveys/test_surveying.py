@@ -199,15 +199,15 @@ def test_files_of_known_facts_are_read(tmp_path):
     path = tmp_path / "known.toml"
     path.write_text(
         "[[distances]]\nbetween = [4, 1]\ndistance_m = 3.06\n"
-        "[[distances]]\nbetween = [1, 2]\ndistance_m = 2\nsigma_m = 0.02\narrangement = 'B'\n"
-        "[[positions]]\ntag = 4\nposition_m = [0.5, 5.2, 2.4]\n"
+        "[[distances]]\nbetween = [65535, 300]\ndistance_m = 2\nsigma_m = 0.02\narrangement = 'B'\n"
+        "[[positions]]\ntag = 65535\nposition_m = [0.5, 5.2, 2.4]\n"
         "[[positions]]\ntag = 0\nposition_m = [1, 2, 3]\nsigma_m = 0.03\narrangement = 'A'\n"
         "[[arrangements]]\nname = 'B'\norder = [3, 1, 4, 2]\nstart_s = 70\nend_s = 130.5\n"
     )
     known = load_knowledge(path)
-    assert known.distances == (KnownDistance(1, 4, 3.06, 0.005, ""), KnownDistance(1, 2, 2.0, 0.02, "B"))
+    assert known.distances == (KnownDistance(1, 4, 3.06, 0.005, ""), KnownDistance(300, 65535, 2.0, 0.02, "B"))
     assert known.positions == (
-        calib.KnownPosition(4, (0.5, 5.2, 2.4), 0.01, ""),
+        calib.KnownPosition(65535, (0.5, 5.2, 2.4), 0.01, ""),
         calib.KnownPosition(0, (1.0, 2.0, 3.0), 0.03, "A"),
     )
     assert (known.spans_s, known.order_of(uwblink.Arrangement("B", 0, 1))) == ({"B": (70.0, 130.5)}, (3, 1, 4, 2))

@@ -38,50 +38,63 @@ GEOMETRIC = {"radio.multipath": {"model": "geometric", "scatterers": 3}}
 
 
 @pytest.mark.parametrize(
-    ("overrides", "fragment"),
+    ("source", "overrides", "fragment"),
     [
-        ({"tags.1.pattern_db": [1.0] * 5}, r"tags\[1\].pattern_db: found 5 coefficients, expected 1, 4, 9, 16, 25"),
-        (
-            {"ranging.reply": {"model": "quantiles", "delays_us": [302.0, 301.0]}},
-            "reply.delays_us: .* must not decrease",
-        ),
-        (
-            {"bodies.0.temperature_c": {"model": "table", "times_s": [0, 0], "values": [1, 2]}},
-            r"bodies\[0\]\.temperature_c.*times_s: .* must increase",
-        ),
+        ("run = {\n", (), r"^scenario: not valid TOML"),
+        ({"ranging": {"rate_hz": 1.0}}, (), r"^scenario: run: missing"),
+        ("nowhere.toml", (), r"nowhere\.toml: no such scenario file"),
+        ("noiseless", ["run"], r"^`overrides`: found 'run' *, expected key"),
+        ("noiseless", {"run.seed.x": 1}, r"^run\.seed\.x: seed is not a table"),
         *(
-            ({"radio.multipath": TWO_STATE | change}, fragment)
-            for change, fragment in (
-                ({"share_std": 0.5}, "share_std: found 0.5, with a mean of 0.3 it is below 0.458"),
-                ({"total_loss_db": 20.0}, "total_loss_db: found 20, at most first_path_loss_db"),
-                ({"pairs": [{"tags": [1, 1]}]}, "tags: found .1, 1., give two tags"),
-                ({"pairs": [{"tags": [1, 2]}, {"tags": [2, 1]}]}, "each pair once"),
-                ({"pairs": [{"tags": [1, 9]}]}, "found tag 9, the tags are 1, 2, 3"),
-                ({"model": "three-state"}, "model"),
-                ({"life_s": 0.0}, "life_s"),
+            ("noiseless", overrides, fragment)
+            for overrides, fragment in (
+                (
+                    {"tags.1.pattern_db": [1.0] * 5},
+                    r"tags\[1\].pattern_db: found 5 coefficients, expected 1, 4, 9, 16, 25",
+                ),
+                (
+                    {"ranging.reply": {"model": "quantiles", "delays_us": [302.0, 301.0]}},
+                    "reply.delays_us: .* must not decrease",
+                ),
+                (
+                    {"bodies.0.temperature_c": {"model": "table", "times_s": [0, 0], "values": [1, 2]}},
+                    r"bodies\[0\]\.temperature_c.*times_s: .* must increase",
+                ),
+                *(
+                    ({"radio.multipath": TWO_STATE | change}, fragment)
+                    for change, fragment in (
+                        ({"share_std": 0.5}, "share_std: found 0.5, with a mean of 0.3 it is below 0.458"),
+                        ({"total_loss_db": 20.0}, "total_loss_db: found 20, at most first_path_loss_db"),
+                        ({"pairs": [{"tags": [1, 1]}]}, "tags: found .1, 1., give two tags"),
+                        ({"pairs": [{"tags": [1, 2]}, {"tags": [2, 1]}]}, "each pair once"),
+                        ({"pairs": [{"tags": [1, 9]}]}, "found tag 9, the tags are 1, 2, 3"),
+                        ({"model": "three-state"}, "model"),
+                        ({"life_s": 0.0}, "life_s"),
+                    )
+                ),
+                (GEOMETRIC, "radio.multipath.scatterers: found 3 but no room"),
+                (
+                    GEOMETRIC | {"room": ROOM | {"reflection_loss_db": 6.0}},
+                    "room.reflection_loss_db: found 6, but in the geometric model",
+                ),
+                (GEOMETRIC | {"room": ROOM | {"floor": "cheese"}}, "room.floor.*cheese.*known are air"),
+                (["run.duration_s=1e16"], r"run\.duration_s: found 1e\+16, at most 1e\+07 is allowed \(time"),
+                (["tags.0.tx_power_db=1e16"], r"tags\[0\]\.tx_power_db: found 1e\+16, at most 500"),
+                (["tags.0.lever_arm_m=[1e200, 0, 0]"], r"tags\[0\]\.lever_arm_m: found 1e\+200, at most 1e\+06"),
+                (["tags.0.ramp_ppm_per_s=-1e9"], r"tags\[0\]\.ramp_ppm_per_s: found -1e\+09, at most 10000 .*crystal"),
+                (["bodies.0.motion.speed_mps=1e16"], r"motion\.speed_mps: found 1e\+16, at most 10000 is allowed \("),
+                (["tags.9.skew_ppm=1"], "index"),
+                (["tags.x.skew_ppm=1"], "index"),
+                (["ranging.rate_hz.deep=1"], "rate_hz"),
+                (["=1"], "key.path=value"),
+                (["ranging.speed=1"], "unknown key"),
             )
         ),
-        (GEOMETRIC, "radio.multipath.scatterers: found 3 but no room"),
-        (
-            GEOMETRIC | {"room": ROOM | {"reflection_loss_db": 6.0}},
-            "room.reflection_loss_db: found 6, but in the geometric model",
-        ),
-        (GEOMETRIC | {"room": ROOM | {"floor": "cheese"}}, "room.floor.*cheese.*known are air"),
-        (["run.duration_s=1e16"], r"run\.duration_s: found 1e\+16, at most 1e\+07 is allowed \(time"),
-        (["tags.0.tx_power_db=1e16"], r"tags\[0\]\.tx_power_db: found 1e\+16, at most 500"),
-        (["tags.0.lever_arm_m=[1e200, 0, 0]"], r"tags\[0\]\.lever_arm_m: found 1e\+200, at most 1e\+06"),
-        (["tags.0.ramp_ppm_per_s=-1e9"], r"tags\[0\]\.ramp_ppm_per_s: found -1e\+09, at most 10000 .*crystal"),
-        (["bodies.0.motion.speed_mps=1e16"], r"motion\.speed_mps: found 1e\+16, at most 10000 is allowed \("),
-        (["tags.9.skew_ppm=1"], "index"),
-        (["tags.x.skew_ppm=1"], "index"),
-        (["ranging.rate_hz.deep=1"], "rate_hz"),
-        (["=1"], "key.path=value"),
-        (["ranging.speed=1"], "unknown key"),
     ],
 )
-def test_values_that_cannot_be_and_keys_that_lead_nowhere_are_named(overrides, fragment):
+def test_values_that_cannot_be_and_keys_that_lead_nowhere_are_named(source, overrides, fragment):
     with pytest.raises(uwbsim.ScenarioError, match=fragment):
-        uwbsim.load("noiseless", overrides)
+        uwbsim.load(source, overrides)
 
 
 @pytest.mark.parametrize("value", [10**400, -2e6, (0.0, 2e6), ((0.0, 1.0), (2e6, 3.0)), (1.0, 10**400)])
