@@ -35,6 +35,11 @@ def path(tmp_path_factory):
     return written(tmp_path_factory.mktemp("source") / "sample.uwb", flight, flight.meta["planted"])
 
 
+@pytest.fixture
+def flight():
+    return sample_flight()
+
+
 def assert_same(one, other):
     for name, column in one.to_dict().items():
         np.testing.assert_array_equal(column, getattr(other, name), err_msg=name)
@@ -74,9 +79,8 @@ def test_every_function_accepts_the_sources_of_a_fit(tmp_path):
     np.testing.assert_allclose(away - away.mean(), 0, atol=0.02)
 
 
-def test_objects_with_the_attributes_of_a_source_are_read():
+def test_objects_with_the_attributes_of_a_source_are_read(flight):
     """An object of another class, with only the attributes that a source needs."""
-    flight = sample_flight()
     bare = SimpleNamespace(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags)
     assert load_ranges(bare).planted is None
     assert_same(load_ranges(bare), load_ranges(flight))
@@ -86,8 +90,7 @@ def test_objects_with_the_attributes_of_a_source_are_read():
         assert load_ranges(SimpleNamespace(**vars(bare), **said)).planted == planted
 
 
-def test_exchanges_with_their_distances_need_no_poses():
-    flight = sample_flight()
+def test_exchanges_with_their_distances_need_no_poses(flight):
     truth = load_ranges(flight).truth_m
     assert_same(load_ranges(replace(flight.exchanges, truth_m=truth)), load_ranges(flight))
     assert_same(calib.Ranges.from_exchanges(flight.exchanges, truth), load_ranges(flight))
@@ -366,8 +369,7 @@ def test_ranges_and_true_distances_in_millimetres_are_refused():
         calib.fit(ranges)
 
 
-def test_results_become_frames():
-    flight = calib.sample_flight()
+def test_results_become_frames(flight):
     ranges = calib.load_ranges(flight)
     result = calib.fit(ranges)
     assert ranges.to_pandas().raw_m.to_numpy() == pytest.approx(ranges.raw_m)

@@ -79,6 +79,11 @@ def same(found, rows, bits=32):
     np.testing.assert_allclose(found.exchanges.range_m, [row["truth"] for row in rows], atol=1e-9)
 
 
+@pytest.fixture
+def rows():
+    return flights()
+
+
 POSE = ("time_s", "body", "x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -101,15 +106,13 @@ def read_rows(tmp_path, rows, text=None):
 
 
 @pytest.mark.parametrize("delimiter", [";", "\t", "|"])
-def test_any_delimiter_with_a_byte_order_mark_comments_and_windows_lines(tmp_path, delimiter):
-    rows = flights()
+def test_any_delimiter_with_a_byte_order_mark_comments_and_windows_lines(tmp_path, delimiter, rows):
     path = write(tmp_path / "t.csv", wrapped(rows), delimiter)
     path.write_text("\ufeff# what this is\n" + path.read_text(), newline="\r\n")
     same(read_table(path), rows)
 
 
-def test_several_files_are_one_table(tmp_path):
-    rows = flights()
+def test_several_files_are_one_table(tmp_path, rows):
     paths = [write(tmp_path / f"{k}.csv", wrapped(rows[k::2])) for k in (0, 1)]
     same(read_table(paths), rows)
     same(read_source(paths[::-1]), rows)
@@ -128,8 +131,7 @@ def test_several_files_are_one_table(tmp_path):
         ('"ticks"', 1, 2**60),  # which no float holds
     ],
 )
-def test_unwrapped_stamps_in_any_unit(tmp_path, unit, scale, after):
-    rows = flights()
+def test_unwrapped_stamps_in_any_unit(tmp_path, unit, scale, after, rows):
     scaled = [{n: repr(v * scale) if n in HEADER[3:9] else v for n, v in later(row, after).items()} for row in rows]
     found = read_rows(tmp_path, [{n: row[n] for n in HEADER} for row in scaled], f"[units]\nstamps = {unit}\n")
     # The first stamp of a clock has the rounding error of a float of so many seconds; the following intervals do not.
@@ -220,8 +222,7 @@ def test_iso_times_names_and_programmed_delays(tmp_path):
     assert abs(int(found.exchanges.time_ns[0]) - 1714972090_000000000) < 1000
 
 
-def test_unused_repeated_headers_are_accepted(tmp_path):
-    rows = flights()
+def test_unused_repeated_headers_are_accepted(tmp_path, rows):
     lines = write(tmp_path / "t.csv", wrapped(rows)).read_text().splitlines()
     (tmp_path / "t.csv").write_text(
         "\n".join(f"{'note,note' if k == 0 else 'a,b'},{line}" for k, line in enumerate(lines))
