@@ -21,7 +21,6 @@ from tests.boards import bench_scenario, record_bench, served
 from tests.processes import refuse, run, succeed
 from tests.shared_data import ROOT
 from uwblink.boards.ports import Terminal
-from uwbsim.boards.server import Server
 
 NOISELESS = (ROOT / "scenarios" / "noiseless.toml").read_text()
 BENCH = ROOT / "scenarios" / "two_boards_on_a_bench" / "bench.toml"
@@ -375,7 +374,7 @@ def test_a_server_takes_over_the_links_of_a_killed_one(tmp_path, numbered, names
     """The links lead to terminals that the new server opens again, also for another board."""
     for tag, name in enumerate(names, 1):
         (tmp_path / f"tag{tag}").symlink_to(tmp_path / f"pts{name}")
-    server = Server(bench_scenario(), tmp_path)
+    server = uwbsim.Server(bench_scenario(), tmp_path)
     assert [(tmp_path / f"tag{tag}").readlink().name for tag in (1, 2, 3)] == ["pts0", "pts1", "pts2"]
     server.close()
     assert not [*tmp_path.glob("tag*")]
@@ -387,7 +386,7 @@ def test_terminals_of_which_one_cannot_have_its_link_leave_no_other_link(tmp_pat
     with uwblink.Recording.open(tmp_path / "r.uwb") as recording, pytest.raises(uwblink.errors.PortError, match="tag2"):
         uwblink.boards.play(recording, lambda names: None, link_dir=tmp_path)
     with pytest.raises(uwblink.errors.PortError, match="tag2"):
-        Server(bench_scenario(), tmp_path)
+        uwbsim.Server(bench_scenario(), tmp_path)
     assert [(path.name, path.read_text()) for path in tmp_path.glob("tag*")] == [("tag2", "mine")]
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tests.uwblink.test_twr import exchange
-from uwblink import twr
-from uwblink.errors import ArgumentError
+from uwblink import errors, twr
 from uwblink.plugins import Registry
 from uwblink.protocols.table import (
     PROTOCOLS,
@@ -85,18 +84,18 @@ def test_a_mixture_of_protocols_keeps_each_to_its_own_formula(registered):
 def test_exchanges_of_an_unknown_protocol_are_refused_by_name():
     unknown = replace(exchange("ds", 1000, 20_000_000, 98_320_384, 0, 0), protocol=np.array(["tdoa"]))
     for function in (raw_range, delay_weights, intervals):
-        with pytest.raises(ArgumentError, match=r"protocol: found 'tdoa', allowed: ss, "):
+        with pytest.raises(errors.ArgumentError, match=r"protocol: found 'tdoa', allowed: ss, "):
             function(unknown)
 
 
 def test_names_of_protocols_are_unique(registered):
-    with pytest.raises(ArgumentError, match=r"already registered; choose another name, or use replace=True"):
+    with pytest.raises(errors.ArgumentError, match=r"already registered; choose another name, or use replace=True"):
         register_protocol(registered)
     register_protocol(replace(registered, title="better"), replace=True)
     assert PROTOCOLS[registered.name].title == "better"
-    with pytest.raises(ArgumentError, match="'ds': this name is reserved"):
+    with pytest.raises(errors.ArgumentError, match="'ds': this name is reserved"):
         register_protocol(replace(registered, name="ds"), replace=True)
-    with pytest.raises(ArgumentError, match="'ss': was not registered"):
+    with pytest.raises(errors.ArgumentError, match="'ss': was not registered"):
         PROTOCOLS.remove("ss")
 
 
@@ -149,7 +148,7 @@ def backwards(t):
     ],
 )  # fmt: skip
 def test_wrong_protocols_are_refused_in_one_line(protocol, expected):
-    with pytest.raises(ArgumentError, match=rf"\A.*({expected}).*\Z"):
+    with pytest.raises(errors.ArgumentError, match=rf"\A.*({expected}).*\Z"):
         register_protocol(protocol)
     assert SYMMETRIC.name not in PROTOCOLS
 

@@ -19,8 +19,7 @@ from tests.uwblink.importers.test_table_forms import (
     wrapped,
     write,
 )
-from uwblink import import_recording, load
-from uwblink.errors import ImportTableError
+from uwblink import errors, import_recording, load
 from uwblink.importers.column_map import load_map
 from uwblink.importers.guess import guess_map
 from uwblink.ticks import TICKS_PER_SECOND
@@ -76,7 +75,7 @@ def test_guesses_read_tables_with_common_column_names_correctly(tmp_path, called
 
 def test_a_table_of_poses_is_sent_to_the_command_for_poses(tmp_path):
     (tmp_path / "p.csv").write_text("time_s,body,x,y,z,qx,qy,qz,qw\n0,a,1,2,3,0,0,0,1\n1,a,1,2,3,0,0,0,1\n")
-    with pytest.raises(ImportTableError, match="uwblink poses"):
+    with pytest.raises(errors.ImportTableError, match="uwblink poses"):
         guess_map(tmp_path / "p.csv")
 
 
@@ -230,12 +229,12 @@ def test_missing_information_is_asked_for(tmp_path, row, asked, answer):
     rows = [{n: v + k if n in ("t", "range", "t_s") else v for n, v in row.items()} for k in range(40)]
     text = guess_map(write(tmp_path / "t.csv", rows)).text
     assert f'{asked} = "?"' in text
-    with pytest.raises(ImportTableError, match=asked):
+    with pytest.raises(errors.ImportTableError, match=asked):
         read_rows(tmp_path, rows, text)
     if answer == '"?"':
         return
     if asked != "time":
-        with pytest.raises(ImportTableError, match=f"units.{asked}"):
+        with pytest.raises(errors.ImportTableError, match=f"units.{asked}"):
             read_rows(tmp_path, rows, text.replace(f'{asked} = "?"', "#"))
     found = read_rows(tmp_path, rows, text.replace(f'{asked} = "?"', f'{asked} = "{answer}"'))
     assert found.exchanges.time_ns[1] - found.exchanges.time_ns[0] == (10**6 if asked == "time" else 10**9)

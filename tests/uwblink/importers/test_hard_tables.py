@@ -28,8 +28,7 @@ from tests.uwblink.importers.test_table_forms import (
     wrapped,
     write,
 )
-from uwblink import Contents, Exchanges, import_recording, load, register_importer
-from uwblink.errors import ArgumentError, ImportTableError, RecordingError, RecordingExistsError
+from uwblink import Contents, Exchanges, errors, import_recording, load, register_importer
 from uwblink.exporters import EXPORTERS, Exporter, export_recording
 from uwblink.importers import (
     IMPORTERS,
@@ -104,7 +103,7 @@ def endless():
 def test_files_that_are_no_tables_or_have_too_much_in_a_line_are_refused(tmp_path, name, content, said):
     content = content() if callable(content) else content
     (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-    with pytest.raises(ImportTableError, match=one_line(name, said)) as caught:
+    with pytest.raises(errors.ImportTableError, match=one_line(name, said)) as caught:
         import_recording(tmp_path / name, tmp_path / "o.uwb")
     assert len(str(caught.value)) < 3000
     assert [path.name for path in tmp_path.iterdir()] == [name]
@@ -128,10 +127,10 @@ def test_a_plug_in_that_fails_is_one_line_with_its_name(tmp_path):
     import_recording(write(tmp_path / "t.csv", wrapped(flights())), tmp_path / "t.uwb")
     with registered(IMPORTERS, Importer("flux", (".flux",), fails, "Import flux.")):
         for work in (partial(import_recording, output=tmp_path / "o.uwb"), read_source):
-            with pytest.raises(ImportTableError, match=r"'flux'.*StrangeError: no such flux") as caught:
+            with pytest.raises(errors.ImportTableError, match=r"'flux'.*StrangeError: no such flux") as caught:
                 work(tmp_path / "a.flux")
             assert isinstance(caught.value.__cause__, StrangeError)
-    said = pytest.raises(RecordingError, match=r"'flux'.*StrangeError")
+    said = pytest.raises(errors.RecordingError, match=r"'flux'.*StrangeError")
     with registered(EXPORTERS, Exporter("flux", fails, "flux")), said:
         export_recording(tmp_path / "t.uwb", tmp_path / "out", to="flux")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.flux", "t.csv", "t.uwb"]
@@ -143,7 +142,7 @@ def test_errors_name_the_given_file(tmp_path):
         return [folder / "flux.csv"], ColumnMap()
 
     (tmp_path / "a.flux").touch()
-    said = pytest.raises(ImportTableError, match=rf"^{tmp_path}/a.flux: has a header but no rows$")
+    said = pytest.raises(errors.ImportTableError, match=rf"^{tmp_path}/a.flux: has a header but no rows$")
     with registered(IMPORTERS, Importer("flux", (".flux",), None, "Import flux.", tables=tables)), said:
         import_recording(tmp_path / "a.flux", tmp_path / "o.uwb")
 
@@ -216,7 +215,7 @@ def test_a_long_table_is_the_same_a_few_rows_at_a_time(tmp_path, monkeypatch, la
 @pytest.mark.parametrize("layout", ["messages", "stamps", "parts"])
 def test_a_table_without_any_device_is_refused_with_that_reason(tmp_path, layout):
     lines = [line | {"from_id": "", "message": 1} for line in lines_of(layout)]
-    with pytest.raises(ImportTableError, match="row 2, column 'from_id'"):
+    with pytest.raises(errors.ImportTableError, match="row 2, column 'from_id'"):
         read_rows(tmp_path, lines, f'layout = "{layout}"\n[columns]\nsequence = "seq"\n')
 
 
@@ -268,7 +267,7 @@ def test_memory_does_not_grow_with_what_is_read(tmp_path, monkeypatch, form, at_
 def read_blanks(source, map_file):
     rows = [[int(cell) for cell in line.split()] for line in source.read_text().splitlines()]
     if any(len(row) != 6 for row in rows):
-        raise ImportTableError(f"{source}: expected six numbers a line")
+        raise errors.ImportTableError(f"{source}: expected six numbers a line")
     one, other, tx1, rx1, tx2, rx2 = np.array(rows).T
     more = {"map": map_file.read_text()} if map_file else {}
     return Contents(exchanges=Exchanges.from_arrays(one, other, tx1=tx1, rx1=rx1, tx2=tx2, rx2=rx2), meta=more)
@@ -301,20 +300,20 @@ def test_the_longest_ending_decides(tmp_path):
 def test_without_a_map_there_is_no_option_for_one(tmp_path):
     with registered(IMPORTERS, replace(BLANKS, name="plain", map_help=None)):
         assert "--map" not in succeed("uwblink", "import", "plain", "--help").stdout
-        with pytest.raises(ArgumentError, match="`map_file`: importer 'plain' uses none"):
+        with pytest.raises(errors.ArgumentError, match="`map_file`: importer 'plain' uses none"):
             import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb", importer="plain", map_file=tmp_path / "m")
 
 
 def test_files_that_cannot_be_imported_are_named(source, tmp_path):
     with pytest.raises(
-        ImportTableError,
+        errors.ImportTableError,
         match=r"t\.xls: no importer for this kind of file; the known ones are \.csv, \.csv\.gz, .*\.ranges",
     ):
         import_recording(tmp_path / "t.xls", tmp_path / "x.uwb")
-    with pytest.raises(ArgumentError, match="importer: found 'xls', allowed: csv"):
+    with pytest.raises(errors.ArgumentError, match="importer: found 'xls', allowed: csv"):
         import_recording(source, tmp_path / "x.uwb", importer="xls")
     (tmp_path / "old.uwb").write_text("")
-    with pytest.raises(RecordingExistsError):
+    with pytest.raises(errors.RecordingExistsError):
         import_recording(source, tmp_path / "old.uwb")
 
 
@@ -331,12 +330,12 @@ def test_files_that_cannot_be_imported_are_named(source, tmp_path):
     ],
 )
 def test_wrong_importers_are_refused(change, expected):
-    with pytest.raises(ArgumentError, match=expected):
+    with pytest.raises(errors.ArgumentError, match=expected):
         register_importer(replace(BLANKS, **change))
 
 
 def test_a_reader_must_return_contents(tmp_path):
     broken = replace(BLANKS, name="broken", read=lambda *_: [1, 2])  # type: ignore[arg-type]
-    said = pytest.raises(ArgumentError, match=r"importer 'broken': returned \[1, 2\], expected Contents")
+    said = pytest.raises(errors.ArgumentError, match=r"importer 'broken': returned \[1, 2\], expected Contents")
     with registered(IMPORTERS, broken), said:
         import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb")

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tests import processes
 from tests.errors import one_line
-from uwblink import Contents, Exchanges, Tag, load
-from uwblink.errors import ImportTableError
+from uwblink import Contents, Exchanges, Tag, errors, load
 from uwblink.importers.poses import read_poses
 from uwblink.recording.distances import distances_m
 
@@ -228,7 +227,7 @@ def test_exports_that_lack_something_are_refused_with_its_name(tmp_path, name, b
     text = broken(tmp_path)
     if isinstance(text, str):
         (tmp_path / name).write_text(text)
-    with pytest.raises(ImportTableError, match=one_line(said)):
+    with pytest.raises(errors.ImportTableError, match=one_line(said)):
         read_poses(tmp_path / name)
 
 

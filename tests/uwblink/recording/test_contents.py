@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from tests.uwblink.recording.test_file import random_exchanges
-from uwblink import Arrangement, Contents, Exchanges, KnownDistance, Poses, Recording, Tag, exporters, load
-from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError
+from uwblink import Arrangement, Contents, Exchanges, KnownDistance, Poses, Recording, Tag, errors, exporters, load
 from uwblink.exporters import export_recording, mcap
 from uwblink.recording.contents import exchanges_with_poses, pieces
 from uwblink.recording.distances import distances_m, poses_around, tracks_of
@@ -125,9 +124,9 @@ def test_entries_of_meta_are_added_or_replaced(full, tmp_path):
 
 def test_mistakes_are_one_line_and_leave_nothing(full, tmp_path):
     with Recording.open(full) as source:
-        with pytest.raises(RecordingError, match="no table 'ranges' in a recording; there are meta, tags"):
+        with pytest.raises(errors.RecordingError, match="no table 'ranges' in a recording; there are meta, tags"):
             source.copy(tmp_path / "copy.uwb", replacing={"ranges": []})
-        with pytest.raises(RecordingExistsError):
+        with pytest.raises(errors.RecordingExistsError):
             source.copy(full)
     assert not list(tmp_path.iterdir())
 
@@ -215,7 +214,7 @@ def test_it_prints_itself_on_a_screen():
     ],
 )
 def test_wrong_selections_are_refused(wrong, expected):
-    with pytest.raises(ArgumentError, match=expected):
+    with pytest.raises(errors.ArgumentError, match=expected):
         made().select(**wrong)
 
 

@@ -9,8 +9,7 @@ import pytest
 
 from tests.errors import one_line
 from tests.uwblink.recording.test_file import change, random_exchanges
-from uwblink import Contents, Recording, Tag
-from uwblink.errors import RecordingError
+from uwblink import Contents, Recording, Tag, errors
 from uwblink.exporters import export_recording
 from uwblink.recording import store
 
@@ -72,7 +71,7 @@ ENDLESS = (
 def test_programs_in_a_file_are_refused_in_one_line(file, statements, named):
     """Files are opened for reading, and those with two statements for updating."""
     change(file, *statements)
-    with pytest.raises(RecordingError, match=one_line("stranger.uwb", named)):
+    with pytest.raises(errors.RecordingError, match=one_line("stranger.uwb", named)):
         Recording.open(file, update=len(statements) == 2)
 
 
@@ -85,7 +84,7 @@ def test_a_trigger_in_a_file_is_refused(file, tmp_path):
         db.execute("COPY FROM DATABASE plain TO stranger")
         db.execute("USE stranger")
         db.execute("CREATE TRIGGER t AFTER INSERT ON poses FOR EACH STATEMENT DELETE FROM tags")
-    with pytest.raises(RecordingError, match=r"stranger2\.uwb: contains a trigger, t;"):
+    with pytest.raises(errors.RecordingError, match=r"stranger2\.uwb: contains a trigger, t;"):
         Recording.open(tmp_path / "stranger2.uwb", update=True)
 
 
@@ -99,7 +98,7 @@ def test_recordings_may_have_names_of_databases(file, tmp_path):
 
 def test_an_export_looks_the_file_over_too(file, tmp_path):
     change(file, "DROP TABLE poses", "CREATE VIEW poses AS SELECT 1 AS time_ns")
-    with pytest.raises(RecordingError, match="a view, poses"):
+    with pytest.raises(errors.RecordingError, match="a view, poses"):
         export_recording(file, tmp_path / "out", to="csv")
     assert not (tmp_path / "out").exists()
 
@@ -116,7 +115,7 @@ def test_writers_use_only_the_folder_of_the_recording(tmp_path):
     (tmp_path / "here").mkdir()
     with (
         Recording.create(tmp_path / "here" / "new.uwb", live=True) as recording,
-        pytest.raises(RecordingError, match=r"new.uwb: cannot be written any more .*disabled"),
+        pytest.raises(errors.RecordingError, match=r"new.uwb: cannot be written any more .*disabled"),
     ):
         recording._execute(f"ATTACH '{tmp_path / 'elsewhere.uwb'}' AS elsewhere")
     assert not (tmp_path / "elsewhere.uwb").exists()
@@ -128,7 +127,7 @@ def test_more_rows_than_a_file_can_hold_are_not_read(file, monkeypatch):
     with Recording.open(file) as recording:
         assert recording.count("height") == 3_000_000
     monkeypatch.setattr(store, "ROWS_OF_ANY_FILE", 2_000_000)
-    with pytest.raises(RecordingError, match="table height holds 3000000 rows"):
+    with pytest.raises(errors.RecordingError, match="table height holds 3000000 rows"):
         Recording.open(file)
 
 
@@ -146,7 +145,7 @@ def test_more_rows_than_a_file_can_hold_are_not_read(file, monkeypatch):
 )
 def test_wrong_json_and_too_many_bytes_in_meta_are_refused(file, value, expected):
     change(file, f"INSERT INTO meta VALUES ('x', {value})")
-    with pytest.raises(RecordingError, match=expected) as caught:
+    with pytest.raises(errors.RecordingError, match=expected) as caught:
         Recording.open(file)
     assert len(str(caught.value)) < 300
 
@@ -178,14 +177,14 @@ def test_wrong_json_and_too_many_bytes_in_meta_are_refused(file, value, expected
 )
 def test_missing_values_wrong_orders_and_widths_of_stamps_are_refused_when_they_are_read(file, table, statement, said):
     change(file, statement)
-    with Recording.open(file) as recording, pytest.raises(RecordingError, match=said):
+    with Recording.open(file) as recording, pytest.raises(errors.RecordingError, match=said):
         getattr(recording, table)()
 
 
 def test_endless_reads_are_interrupted(file):
     recording = Recording.open(file)
     recording._longest_read_s = 0.3
-    with pytest.raises(RecordingError, match="took longer than 0 s"):
+    with pytest.raises(errors.RecordingError, match="took longer than 0 s"):
         recording._select("SELECT sum(a.range * b.range) FROM range(10000000) a, range(10000000) b")
     recording._longest_read_s = 60.0
     assert recording._select("SELECT 1 AS one")["one"].tolist() == [1]
