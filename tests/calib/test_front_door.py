@@ -16,7 +16,6 @@ from calib.report.sections import SECTIONS
 from tests import pages
 from tests.calib.synthetic import bias_m, ranges
 from uwblink.pages import figures
-from uwblink.pages.figures import style
 
 
 @pytest.mark.slow
@@ -84,7 +83,7 @@ def fitted():
 
 
 def axes_of(draw):
-    with style():
+    with figures.style():
         figure = Figure(figsize=(7.16, 3), layout="constrained")
         axes = draw(figure.subplots())
         figure.draw_without_rendering()

@@ -18,7 +18,6 @@ from uwblink.ticks import elapsed
 from uwblink.twr import truncate4
 from uwblink.wire import messages as m
 from uwblink.wire.codec import Decoder
-from uwblink.wire.messages import REPORTS
 from uwbsim.boards.virtual_board import VirtualPorts
 
 ABSENT = 9
@@ -304,7 +303,7 @@ class Client:
         data, self.came = self.came, b""
         found = []
         for part in re.split(rb"(?=[RS]\d\d\|)", data):
-            found += [e for e in Decoder(REPORTS).feed(part) if isinstance(e, m.Message)]
+            found += [e for e in Decoder(m.REPORTS).feed(part) if isinstance(e, m.Message)]
         return found
 
 

@@ -11,7 +11,6 @@ import calib
 from benchmarks.worlds import CLEAN, LIGHT_M_PER_NS, Recipe, make
 from calib.estimator import known_distances
 from calib.estimator.covariance import Kept, sandwich
-from calib.estimator.known_distances import fit_known_distances, model_of, robust_fit
 from calib.estimator.score_tests import Slopes
 from calib.estimator.time_blocks import TimeBlocks, persistence, time_blocks
 from calib.estimator.to_calibration import mean_variance
@@ -21,13 +20,15 @@ from tests.shared_data import rows_of
 
 
 def fitted(recipe, seed=12_003, **settings):
-    return fit_known_distances(make(recipe, seed).ranges, calib.FitSettings(**settings))
+    return known_distances.fit_known_distances(make(recipe, seed).ranges, calib.FitSettings(**settings))
 
 
 def test_least_squares_of_delays_alone_and_its_variances_agree_with_numpy():
-    model = model_of(make(CLEAN["short, 30 s"], 12_004).ranges[:400], calib.FitSettings(delays_only=True))
+    model = known_distances.model_of(
+        make(CLEAN["short, 30 s"], 12_004).ranges[:400], calib.FitSettings(delays_only=True)
+    )
     error = model.ranges.raw_m - model.ranges.truth_m
-    found = robust_fit(model, error, "l2", None, ("delay",))
+    found = known_distances.robust_fit(model, error, "l2", None, ("delay",))
     delays = found.optimum.layout.indices(["delay"])
     cut = time_blocks(model.ranges.time_ns, model.ranges.session)
     kept = {"delay": Kept.delays(delays, 1e9, model.held)}

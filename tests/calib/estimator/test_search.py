@@ -15,7 +15,6 @@ from calib.estimator.known_distances import fit_known_distances
 from calib.estimator.optimize import maximize
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows, sum_rows
-from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
 from tests.calib.overhearing import flight
 
 
@@ -42,10 +41,10 @@ def test_a_search_ends_at_least_squares_and_finds_the_weight_of_its_prior(most, 
     rng = np.random.default_rng(1)
     seen = np.cumsum(rng.normal(0, 0.5, 200)) + rng.normal(0, 0.1, 200)
     steps = sparse.csr_matrix(np.eye(199, 200, 1) - np.eye(199, 200))
-    prior = Prior(weight=1.0, structure=sparse.csc_matrix(steps.T @ steps), rows=199, bounds=(1e-3, 1e3))
-    layout = Layout((Unknown(kind="path", names=("",) * 200, start=np.zeros(200), priors=(prior,)),))
+    prior = unknowns.Prior(weight=1.0, structure=sparse.csc_matrix(steps.T @ steps), rows=199, bounds=(1e-3, 1e3))
+    layout = unknowns.Layout((unknowns.Unknown(kind="path", names=("",) * 200, start=np.zeros(200), priors=(prior,)),))
     every = NormalRows(value=seen, std=np.full(200, 0.1), entries=np.ones((200, 1)), columns=np.arange(200)[:, None])
-    priors = Priors(layout)
+    priors = unknowns.Priors(layout)
     found = maximize([every], priors, layout.start(), tolerance=1e-6)
     assert found.success
     assert priors.deviation("path") == pytest.approx(0.5, rel=0.15)
@@ -76,7 +75,7 @@ def test_a_search_ends_at_one_optimum_of_unknowns_and_weights(data):
         weights = [w if prior.bounds is None else w * np.exp(rng.normal()) for w, (_, prior) in known]
         # Starts differ by a standard error, in logarithms by a half at most: farther away, there may be other optima.
         away = np.minimum(np.sqrt(np.diag(np.asarray(optimum.covariance))), 0.5) * rng.normal(size=len(optimum.x))
-        again = maximize(rows, Priors(optimum.layout, weights), optimum.x + away, asked=asked)
+        again = maximize(rows, unknowns.Priors(optimum.layout, weights), optimum.x + away, asked=asked)
         assert again.success
         assert again.steps < 25
         # A search ends if a step gains less than 0.01 in log likelihood, at most a tenth of a standard error, for both
@@ -131,16 +130,16 @@ def test_noise_is_that_of_restricted_likelihood_however_many_offsets_there_are(s
     offset, noise = 0.03 * rng.normal(size=(100, 1)), 0.05 * rng.normal(size=(100, 6))
     group, error = np.repeat(np.arange(100), 6), (offset + noise).ravel()
     blocks = [
-        Unknown(kind=kind, names=("",), start=np.array([at]), known=np.array([kind != "noise"]))
+        unknowns.Unknown(kind=kind, names=("",), start=np.array([at]), known=np.array([kind != "noise"]))
         for kind, at in (VALUES | {"long": -30.0, "odds": -40.0, "outliers": -40.0, "noise": -5.0}).items()
     ]
-    prior = Prior.of_deviation(spread_m)
-    blocks.append(Unknown(kind="offset", names=("",) * 100, start=np.zeros(100), priors=(prior,)))
+    prior = unknowns.Prior.of_deviation(spread_m)
+    blocks.append(unknowns.Unknown(kind="offset", names=("",) * 100, start=np.zeros(100), priors=(prior,)))
     parts = [Part(parameter=b.kind, kind=b.kind, columns=np.zeros((1, 1), dtype=np.int64)) for b in blocks[:-1]]
     parts.append(Part(parameter=RESIDUAL, kind="offset", columns=group[:, None], values=np.full((600, 1), -1.0)))
-    layout = Layout(tuple(blocks))
+    layout = unknowns.Layout(tuple(blocks))
     rows = RangeRows.of(error, group, parts, Mixture(restricted=True), layout)
-    found = maximize([rows], Priors(layout), layout.start(), evidence_steps=60)
+    found = maximize([rows], unknowns.Priors(layout), layout.start(), evidence_steps=60)
     within = float(np.mean(np.var(error.reshape(100, 6), axis=1, ddof=1)))
     means = error.reshape(100, 6).mean(axis=1)
 
@@ -153,13 +152,15 @@ def test_noise_is_that_of_restricted_likelihood_however_many_offsets_there_are(s
     assert found.of("noise")[0] == pytest.approx(best, abs=0.005)
     assert np.exp(best) == pytest.approx(0.05, rel=0.08)
     # The joint likelihood gives a smaller value, by up to a tenth.
-    assert maximize([rows], Priors(layout), layout.start(), evidence_steps=0).of("noise")[0] < best - 0.03
+    assert maximize([rows], unknowns.Priors(layout), layout.start(), evidence_steps=0).of("noise")[0] < best - 0.03
 
 
 def test_noise_accounts_for_other_unknowns():
     rng = np.random.default_rng(1)
     kinds = VALUES | {"long": -30.0, RESIDUAL: 0.0}
-    layout = Layout(tuple(Unknown(kind=kind, names=("",), start=np.array([at])) for kind, at in kinds.items()))
+    layout = unknowns.Layout(
+        tuple(unknowns.Unknown(kind=kind, names=("",), start=np.array([at])) for kind, at in kinds.items())
+    )
     count, one = 40_000, np.zeros((1, 1), dtype=np.int64)
     reflected = rng.random(count) < 1 / (1 + np.exp(2.0))
     error = 0.04 * rng.normal(size=count) + reflected * (0.02 + rng.exponential(0.3, count))

@@ -13,7 +13,6 @@ from benchmarks.hours import RATE_HZ, AnsweringPorts
 from tests.boards import bench_scenario, record_bench
 from tests.processes import wait_until
 from uwblink.boards import record as writing
-from uwblink.boards.record import RecordingWriter, append_rows, identify
 from uwblink.boards.recorder import Recorder
 from uwblink.recording.schema import FrameRow
 from uwblink.recording.store import Store
@@ -117,7 +116,7 @@ def test_rows_are_committed_while_a_long_log_is_put_into_the_file(live, monkeypa
 
     monkeypatch.setattr(uwblink.Recording, "shorten_log", shorten_log)
     log, written = Path(f"{live.path}.wal"), []
-    with RecordingWriter(live) as writer:
+    with writing.RecordingWriter(live) as writer:
         writer.on_bytes(1, "port", "in", bytes(30_000))
         assert begun.wait(60)
         for k in range(3):
@@ -132,7 +131,7 @@ def test_rows_are_committed_while_a_long_log_is_put_into_the_file(live, monkeypa
 def test_a_log_stays_short_and_everything_is_in_the_file(live, monkeypatch):
     monkeypatch.setattr(writing, "LONG_LOG", 20_000)
     log, before = Path(f"{live.path}.wal"), live.path.stat().st_size
-    with RecordingWriter(live) as writer:
+    with writing.RecordingWriter(live) as writer:
         writer.on_bytes(1, "port", "in", bytes(range(256)) * 100)
         wait_until(lambda: size(live.path) > before and size(log) < 20_000)
         writer.on_bytes(2, "port", "in", b"later")
@@ -143,7 +142,7 @@ def test_a_log_stays_short_and_everything_is_in_the_file(live, monkeypatch):
     "error", [MemoryError("no more"), RuntimeError("a bug"), uwblink.errors.RecordingError("disk full")]
 )
 def test_failures_of_writing_are_reported_within_a_second(live, monkeypatch, error):
-    writer = RecordingWriter(live)
+    writer = writing.RecordingWriter(live)
 
     def failing(_recording, _table, _rows):
         raise error
@@ -188,7 +187,7 @@ class Committing(uwblink.Listener):
         before = len(STATEMENTS)
         self.rows.append(len(self.batch))
         with self.recording.transaction():
-            append_rows(self.recording, self.batch)
+            writing.append_rows(self.recording, self.batch)
         self.asked.append(STATEMENTS[before:])
         self.batch = []
 
@@ -214,7 +213,7 @@ def test_nothing_grows_with_the_recording(tmp_path, statements):
     ports, held = AnsweringPorts(), {}
     with uwblink.Recording.create(tmp_path / "long.uwb", live=True) as recording:
         committing = Committing(recording)
-        found = identify(ports.names, ports)
+        found = writing.identify(ports.names, ports)
         plan = uwblink.RangingPlan(ports.pairs[:1], rate_hz=RATE_HZ)
         recorder = Recorder(found, plan, plan.turns(sorted(found)), [committing], ports=ports)
         for _ in recorder.steps(stop=lambda: committing.exchanges >= LONG):

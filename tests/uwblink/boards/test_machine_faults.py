@@ -19,7 +19,6 @@ import uwblink
 from benchmarks.hours import AnsweringPort, AnsweringPorts
 from tests import processes
 from tests.boards import bench_scenario, record_bench, served
-from tests.processes import fork
 from uwblink.boards.listeners import Progress
 from uwblink.boards.ports import SerialPorts, Terminal
 from uwblink.boards.record import LONGEST_BACKLOG_S, RecordingWriter, record
@@ -188,8 +187,8 @@ def test_two_recorders_cannot_have_one_file(tmp_path):
     def second():
         with served() as other:
             words = ["uwblink", "record", *other.names.values(), "-o", path, "--pairs", "all", "--force"]
-            found.append(fork(*words, "--duration", "1"))
-        found.append(fork("uwblink", "import", "csv", "docs/examples/exchanges.csv", "-o", path, "--force"))
+            found.append(processes.fork(*words, "--duration", "1"))
+        found.append(processes.fork("uwblink", "import", "csv", "docs/examples/exchanges.csv", "-o", path, "--force"))
 
     record_bench(path, uwblink.RangingPlan(), duration_s=2.0, listeners=[After(t20=second)])
     told = f"error: {path}: another process is writing it; give another name\n"

@@ -17,7 +17,6 @@ from tests.processes import wait_until
 from tests.shared_data import ROOT
 from uwblink.cli import shared
 from uwblink.cli.commands import app
-from uwblink.cli.shared import waiting
 
 
 class MineError(Exception):
@@ -227,7 +226,7 @@ class Terminal(io.StringIO):
 def test_progress_on_a_terminal_is_shown_and_removed(monkeypatch):
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
-    with waiting("fitting [1]") as update:
+    with shared.waiting("fitting [1]") as update:
         update("drawing")
         update(0.25)
         wait_until(lambda: all(shown in screen.getvalue() for shown in ("fitting [1]", "drawing", "25%")))
@@ -235,6 +234,6 @@ def test_progress_on_a_terminal_is_shown_and_removed(monkeypatch):
 
 
 def test_progress_is_not_shown_elsewhere(capsys):
-    with waiting("fitting") as update:
+    with shared.waiting("fitting") as update:
         update(0.5)
     assert capsys.readouterr() == ("", "")

@@ -15,7 +15,6 @@ import pytest
 
 from tests import processes
 from tests.errors import one_line
-from tests.processes import succeed
 from tests.registered import registered
 from tests.uwblink.importers.test_table_forms import (
     HEADER,
@@ -299,7 +298,7 @@ def test_the_longest_ending_decides(tmp_path):
 
 def test_without_a_map_there_is_no_option_for_one(tmp_path):
     with registered(IMPORTERS, replace(BLANKS, name="plain", map_help=None)):
-        assert "--map" not in succeed("uwblink", "import", "plain", "--help").stdout
+        assert "--map" not in processes.succeed("uwblink", "import", "plain", "--help").stdout
         with pytest.raises(errors.ArgumentError, match="`map_file`: importer 'plain' uses none"):
             import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb", importer="plain", map_file=tmp_path / "m")
 

@@ -9,7 +9,6 @@ import pytest
 
 from tests.uwblink.recording.test_file import random_exchanges
 from uwblink import Arrangement, Contents, Exchanges, KnownDistance, Poses, Recording, Tag, errors, exporters, load
-from uwblink.exporters import export_recording, mcap
 from uwblink.recording.contents import exchanges_with_poses, pieces
 from uwblink.recording.distances import distances_m, poses_around, tracks_of
 from uwblink.recording.schema import TABLES, CirRow, Fault, FrameRow
@@ -274,12 +273,13 @@ def test_corrections_of_other_exchanges_are_left_out(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("to", "module"), [("mcap", mcap), ("tum", exporters), pytest.param("rosbag2", mcap, marks=pytest.mark.slow)]
+    ("to", "module"),
+    [("mcap", exporters.mcap), ("tum", exporters), pytest.param("rosbag2", exporters.mcap, marks=pytest.mark.slow)],
 )
 def test_an_export_does_not_depend_on_the_pieces(timed, tmp_path, monkeypatch, to, module):
-    as_one = export_recording(timed, tmp_path / "one", to=to)
+    as_one = exporters.export_recording(timed, tmp_path / "one", to=to)
     monkeypatch.setattr(module, "pieces", partial(pieces, rows=120))
-    assert export_recording(timed, tmp_path / "many", to=to) == as_one
+    assert exporters.export_recording(timed, tmp_path / "many", to=to) == as_one
     files = [sorted(p for p in (tmp_path / name).rglob("*") if p.is_file()) for name in ("one", "many")]
     assert len(files[0]) == len(files[1]) > 0
     for one, other in zip(*files, strict=True):

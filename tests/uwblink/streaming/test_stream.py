@@ -15,7 +15,6 @@ import calib
 import uwblink
 from tests import processes
 from tests.boards import bench_scenario, record_bench, served
-from tests.processes import BIN
 from uwblink.boards import Progress
 from uwblink.streaming import RangeListener
 from uwblink.twr import STAMPS
@@ -201,7 +200,7 @@ def test_the_commands_refuse_a_calibration_of_other_boards_and_write_nothing(tmp
 
 @pytest.mark.slow
 def test_a_stream_ends_if_its_reader_closes_the_pipe(flown):
-    words = f"{BIN / 'uwblink'} stream {flown} --speed 20 | head -n 2"
+    words = f"{processes.BIN / 'uwblink'} stream {flown} --speed 20 | head -n 2"
     done = subprocess.run(["bash", "-c", words], capture_output=True, text=True, timeout=120)
     assert (done.stdout.count("\n"), "Traceback" in done.stderr) == (2, False)
 
