@@ -230,7 +230,11 @@ def planned(tmp_path, slots):
         (planned, "-0.1,1,3\n", r"slot 1 is at -0.1 s, before the start"),
         (planned, "9,1,3\n7,3,1\n", r"first slot is at 7 s, after the end of the run \(run.duration_s = 6\)"),
         (trajectory, 5, r"lasts 5\.0 s and does not cover the run of 6 s"),
-        (with_antennas, lambda lines: [*lines[:20], *lines[21:]], "a hole in the table: no gain_db at azimuth -150"),
+        (
+            with_antennas,
+            lambda lines: [*lines[:20], *lines[21:]],
+            "a hole in the table: no gain_db at azimuth -150, elevation",
+        ),
         (with_antennas, lambda lines: [*lines, lines[-1]], r"monopole\.csv: two rows"),
     ],
 )
