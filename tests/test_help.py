@@ -15,13 +15,16 @@ from typer import rich_utils
 
 import calib
 import uwblink
+import uwbsim
 from calib.cli.commands import app as calib_app
 from calib.cli.judging import spread_tests
+from calib.cli.shared import with_flags
 from calib.fitting import known_losses
 from tests import processes
-from uwblink import PROTOCOLS
+from uwblink.cli import shared
 from uwblink.cli.commands import app as uwblink_app
 from uwblink.exporters import EXPORTERS
+from uwbsim.cli.commands import UWBSIM_FLAGS
 from uwbsim.cli.commands import app as uwbsim_app
 
 COMMANDS: dict[str, Any] = {
@@ -156,13 +159,57 @@ def test_help_lists_the_registered_names():
     }
     for command, option, known in (
         ("calib fit", "loss", known_losses()),
-        ("uwbsim predict", "protocol", PROTOCOLS),
+        ("uwbsim predict", "protocol", uwblink.PROTOCOLS),
         ("uwblink export", "to", EXPORTERS),
     ):
         assert set(parameters[command, option]) == set(known)
     fitted = calib.fit(calib.sample_flight()).calibration
     for form in parameters["calib export", "to"]:
         assert calib.export(fitted, form)
+
+
+# Errors name parameters, and the command line the options for them: not those that only functions have, nor those of
+# calib that its commands name themselves (those of plans), or that belong to ranges from arrays and their errors.
+ONLY_FROM_PYTHON = {
+    "calib": {
+        *("alpha_dbm", "data", "truth_m", "range_m", "target", "weights", "protocol", "name", "before", "section"),
+        *("shares", "start_m", "information", "loosest", "boards", "robots", "anchor_places", "reference"),
+        *("seconds", "speed_m_s", "apart_m", "still_s", "noise_m", "size_m", "rate_hz", "tape_sigma_m"),
+        *("anchor_sigma_m", "side", "odds", "features", "temperature_c"),
+    },
+    "uwbsim": {"effect", "source", "name", "evaluate", "lost_share"},
+}
+
+
+@pytest.mark.parametrize(
+    ("package", "pattern", "known", "more", "flag", "spelled"),
+    [
+        (
+            "calib",
+            r'(?:parameter=|check_choice\()"([a-z_0-9]+)"',
+            {"fixed_ns", "groups", "loss", "tag", "to"},
+            set(),
+            with_flags,
+            list,
+        ),
+        (
+            "uwbsim",
+            r'parameter="([a-z_0-9]+)"',
+            {"count", "overrides", "overhead_s", "workers"},
+            set(uwbsim.State.__dataclass_fields__),
+            lambda text: shared.with_flags(text, UWBSIM_FLAGS),
+            lambda opts: ["/".join(opts)],
+        ),
+    ],
+    ids=["calib", "uwbsim"],
+)
+def test_every_parameter_that_an_error_names_has_its_option(package, pattern, known, more, flag, spelled):
+    named = set[str]()
+    for path in (processes.ROOT / package).rglob("*.py"):
+        named |= set(re.findall(pattern, path.read_text()))
+    options = {o for words, command in EVERY if words[0] == package for p in command.params for o in spelled(p.opts)}
+    assert known <= named
+    assert {flag(f"`{name}`") for name in (named - ONLY_FROM_PYTHON[package]) | more} <= options
 
 
 HEAVY = ["numpy", "scipy", "duckdb", "matplotlib", "simpy", "serial", "pandas", "pypdf", "rosbags"]

@@ -8,9 +8,7 @@ import pytest
 
 import calib
 import uwblink
-from calib.surveys.knowledge import load_knowledge
 from tests.processes import ROOT, refuse, succeed
-from uwblink.errors import PlanError
 
 LARGEST = 65535
 
@@ -58,15 +56,6 @@ def test_large_ids_work_for_other_boards_only(folder):
     (folder / "too_large.toml").write_text("[[anchors]]\nid = 65536\nposition_m = [0.0, 0.0, 0.0]\n")
     refuse("uwblink", "poses", "bare.uwb", "--tags", "too_large.toml", cwd=folder, naming=["anchors[0].id", "65535"])
     refuse("uwbsim", "serve", "s.toml", cwd=folder, naming=["tags", "id 6553", "0 to 254"])
-    with pytest.raises(PlanError, match="pairs"):
+    with pytest.raises(uwblink.errors.PlanError, match="pairs"):
         uwblink.RangingPlan(pairs=((1, 255),))
     assert uwblink.RangingPlan(pairs=((1, 254),)).pairs == ((1, 254),)
-
-
-def test_large_ids_work_in_known_facts(tmp_path):
-    (tmp_path / "known.toml").write_text(
-        f"[[distances]]\nbetween = [{LARGEST}, 300]\ndistance_m = 3.0\n"
-        f"[[positions]]\ntag = {LARGEST}\nposition_m = [0.0, 0.0, 0.0]\n"
-    )
-    known = load_knowledge(tmp_path / "known.toml")
-    assert {known.distances[0].first, known.distances[0].second} == {LARGEST, 300}

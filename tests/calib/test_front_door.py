@@ -16,7 +16,6 @@ from calib.report.sections import SECTIONS
 from tests import pages
 from tests.calib.synthetic import bias_m, ranges
 from uwblink.pages import figures
-from uwblink.pages.figures import style
 
 
 @pytest.mark.slow
@@ -84,7 +83,7 @@ def fitted():
 
 
 def axes_of(draw):
-    with style():
+    with figures.style():
         figure = Figure(figsize=(7.16, 3), layout="constrained")
         axes = draw(figure.subplots())
         figure.draw_without_rendering()
@@ -196,8 +195,3 @@ def test_undetermined_delays_are_drawn_as_circles(fitted):
 def test_planted_delays_are_drawn_moved_by_the_common_shift(fitted):
     axes = axes_of(lambda axes: delays(fitted.calibration, {1: 0.1, 2: -0.2, 3: 0.0, 7: 0.3}, 0.05, axes))
     assert labelled(axes, "planted, same gauge").get_ydata() == pytest.approx([0.15, -0.15, 0.05, 0.35])
-
-
-def test_dictionaries_are_not_lists_of_paths():
-    with pytest.raises(calib.BadInputError, match="`data`: found dict, expected a path"):
-        calib.fit({"range_m": [3.1], "initiator": [1], "target": [2]})

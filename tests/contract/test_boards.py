@@ -3,6 +3,7 @@
 Real boards are tested if the environment variable UWB_PORTS names two ports, separated by a comma.
 """
 
+import random
 import re
 from collections import Counter
 
@@ -16,6 +17,7 @@ from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
 from uwblink.ticks import elapsed
 from uwblink.twr import truncate4
 from uwblink.wire import messages as m
+from uwblink.wire.codec import Decoder
 from uwbsim.boards.virtual_board import VirtualPorts
 
 ABSENT = 9
@@ -26,6 +28,16 @@ def pair(request):
     """The two boards, the initiator first."""
     with two_ports(request.param) as (ports, _):
         yield [Board(port) for port in ports]
+
+
+@pytest.fixture
+def one(pair):
+    return pair[0]
+
+
+@pytest.fixture
+def two(pair):
+    return pair[1]
 
 
 def heard(board, *kinds, within_s=10.0):
@@ -40,8 +52,7 @@ def heard(board, *kinds, within_s=10.0):
     return found
 
 
-def test_every_plain_command_is_answered(pair):
-    one, _ = pair
+def test_every_plain_command_is_answered(one):
     for command, reply in (
         (m.SetIdle(), m.IdleSet()),
         (m.Reset(), m.ResetDone()),
@@ -52,15 +63,13 @@ def test_every_plain_command_is_answered(pair):
         assert one.request(command) == reply
 
 
-def test_all_kinds_of_fields_are_unchanged_by_a_round_trip(pair):
-    one, _ = pair
+def test_all_kinds_of_fields_are_unchanged_by_a_round_trip(one):
     echo = one.request(m.DoTests(-12345, "the test string", True, 1.2345, b"\x00\x01\r|\n\xff"))
     assert echo == m.TestsDone(0, -12345, "the test string", True, 1.2345, b"\x00\x01\r|\n\xff")
     one.test()
 
 
-def test_double_sided_report_keeps_the_firmware_s_arithmetic(pair):
-    one, two = pair
+def test_double_sided_report_keeps_the_firmware_s_arithmetic(one, two):
     report = one.range(two.id)
     assert (report.neighbour, {stamp % 512 for stamp in (report.tx1, report.tx2, report.tx3)}) == (two.id, {52})
     assert int(elapsed(report.tx3, report.tx2)) == 65536 * 1500 + 16384
@@ -69,8 +78,7 @@ def test_double_sided_report_keeps_the_firmware_s_arithmetic(pair):
     assert report.skew1_ppm == pytest.approx(-report.skew2_ppm, abs=3)
 
 
-def test_single_sided_report_has_no_third_message_and_whole_ticks(pair):
-    one, two = pair
+def test_single_sided_report_has_no_third_message_and_whole_ticks(one, two):
     report = one.range(two.id, protocol="ss")
     assert (report.tx3, report.rx3) == (0, 0)
     dt41, dt32 = int(elapsed(report.rx2, report.tx1)), int(elapsed(report.tx2, report.rx1))
@@ -78,8 +86,7 @@ def test_single_sided_report_has_no_third_message_and_whole_ticks(pair):
     assert report.range_m == pytest.approx(int((dt41 - dt32) / 2) * 299_702_547 / (128 * 499.2e6), abs=2e-4)
 
 
-def test_delays_are_set_at_the_target_and_work(pair):
-    one, two = pair
+def test_delays_are_set_at_the_target_and_work(one, two):
     for delay in (280, 700, 3000, 6400, 6500, 1500):
         two.set_response_delay(delay)
         report = one.range(two.id)
@@ -87,8 +94,7 @@ def test_delays_are_set_at_the_target_and_work(pair):
 
 
 @pytest.mark.parametrize("protocol", ["ss", "ds"])
-def test_the_target_reports_the_same_numbers_when_asked_to(pair, protocol):
-    one, two = pair
+def test_the_target_reports_the_same_numbers_when_asked_to(one, two, protocol):
     list(two.reports(0.05))
     report = one.range(two.id, protocol=protocol, target_reports=True)
     (said,) = heard(two, m.TargetRangeReport)
@@ -96,15 +102,13 @@ def test_the_target_reports_the_same_numbers_when_asked_to(pair, protocol):
     assert {name: getattr(said, name) for name in own} == own | {"neighbour": one.id}
 
 
-def test_an_absent_target_fails_with_the_board_s_own_line(pair):
-    one, _ = pair
+def test_an_absent_target_fails_with_the_board_s_own_line(one):
     with pytest.raises(RangingFailedError, match="COMMANDED TASK FAILED AFTER 5 ATTEMPTS"):
         one.range(ABSENT)
     assert one.request(m.GetId()) == m.IdReport(one.id)
 
 
-def test_the_own_id_is_refused_by_the_driver_and_by_the_board(pair):
-    one, _ = pair
+def test_the_own_id_is_refused_by_the_driver_and_by_the_board(one):
     with pytest.raises(RangingFailedError, match="same as the initiator"):
         one.range(one.request(m.GetId()).board)
     assert one.id >= 0
@@ -112,16 +116,14 @@ def test_the_own_id_is_refused_by_the_driver_and_by_the_board(pair):
         one.range(one.id)
 
 
-def test_a_broadcast_reaches_the_other_board(pair):
-    one, two = pair
+def test_a_broadcast_reaches_the_other_board(one, two):
     list(two.reports(0.05))
     payload = b"\x00R00\r\n|RS" + bytes(range(48))
     one.send(payload)
     assert heard(two, m.BroadcastReceived) == [m.BroadcastReceived(payload)]
 
 
-def test_an_impulse_response_comes_with_its_index(pair):
-    one, two = pair
+def test_an_impulse_response_comes_with_its_index(one, two):
     _, response = one.cir(two.id)
     assert ((response.initiator, response.target), len(response.magnitudes)) == ((one.id, two.id), 1016)
     first = response.first_path_milli // 1000
@@ -129,8 +131,7 @@ def test_an_impulse_response_comes_with_its_index(pair):
     assert one.range(two.id).neighbour == two.id
 
 
-def test_harmful_commands_are_not_sent(pair):
-    one, _ = pair
+def test_harmful_commands_are_not_sent(one):
     tests = (m.DoTests(1, "x", True, number, b"") for number in (float("nan"), float("inf"), 9999.1, -9999.1))
     large = m.DoTests(1, "x" * 43, True, 1.0, b"12345")
     for send, value, said in (
@@ -147,16 +148,14 @@ def test_harmful_commands_are_not_sent(pair):
     assert one.request(m.GetId()) == m.IdReport(one.id)
 
 
-def test_the_longest_broadcast_fits_one_packet(pair):
-    one, two = pair
+def test_the_longest_broadcast_fits_one_packet(one, two):
     for _ in range(20):
         one.send(bytes(range(57)))
     assert [e.data for e in heard(two, *[m.BroadcastReceived] * 20)] == [bytes(range(57))] * 20
     assert one.request(m.GetId()) == m.IdReport(one.id)
 
 
-def test_a_target_that_prints_its_impulse_response_is_left_alone(pair):
-    one, two = pair
+def test_a_target_that_prints_its_impulse_response_is_left_alone(one, two):
     # Under load, served boards may be later than the time-out of the driver; then a response may be damaged.
     needed = 10 if one.name.startswith("/dev/pts/") else 20
     good = 0
@@ -169,9 +168,8 @@ def test_a_target_that_prints_its_impulse_response_is_left_alone(pair):
     assert good >= needed
 
 
-def test_a_board_that_prints_a_response_is_not_asked(pair):
+def test_a_board_that_prints_a_response_is_not_asked(one, two):
     """Another process lets the board print a response: the driver detects it and waits."""
-    one, two = pair
     list(two.reports(0.01))
     one.request(m.RangeCommand(two.id, target_reports=True, get_cir=True))
     until_s = two._transport.now_s() + 10
@@ -182,8 +180,7 @@ def test_a_board_that_prints_a_response_is_not_asked(pair):
         assert len(heard(two, m.Cir)) == 1
 
 
-def test_many_exchanges_in_a_row_are_all_good(pair):
-    one, two = pair
+def test_many_exchanges_in_a_row_are_all_good(one, two):
     ranges = [one.range(two.id).range_m for _ in range(60)]
     assert max(ranges) - min(ranges) < 1.0
 
@@ -271,3 +268,83 @@ def test_a_listener_that_misses_the_response_prints_26_fields_and_otherwise_noth
     whole, zeros = 0.7**6, 0.3 + 0.7 * 0.3
     assert counts.total() > 120
     assert counts[26] / counts.total() == pytest.approx(zeros / (zeros + whole), abs=0.097)  # three sigma
+
+
+# Compatibility with the existing client library, which expects the timing of real boards.
+#
+# It keeps no bytes between two reads, scans ids 0 to 10, and takes one line with a time-out at each call.
+
+
+TIMEOUT_S = 0.1
+LATENCY_S = (0.0002, 0.0015)
+"""Time from the end of a line to the next read by the client: of an operating system and an interpreter."""
+
+
+class Client:
+    """A client without a buffer: each call takes a line and all other bytes that have arrived, and discards them."""
+
+    def __init__(self, transport, seed):
+        self.transport, self.came, self.random = transport, b"", random.Random(seed)
+
+    def write(self, data):
+        self.transport.write(data)
+
+    def pass_time(self, seconds):
+        until = self.transport.now_s() + seconds
+        while (left := until - self.transport.now_s()) > 0:
+            self.came += self.transport.read(left)
+
+    def messages(self, timeout_s=TIMEOUT_S):
+        """Return the result of one call: a line, or the bytes until the time-out, and the other waiting bytes."""
+        until = self.transport.now_s() + timeout_s
+        while b"\r\n" not in self.came and (left := until - self.transport.now_s()) > 0:
+            self.came += self.transport.read(left)
+        self.pass_time(self.random.uniform(*LATENCY_S))
+        data, self.came = self.came, b""
+        found = []
+        for part in re.split(rb"(?=[RS]\d\d\|)", data):
+            found += [e for e in Decoder(m.REPORTS).feed(part) if isinstance(e, m.Message)]
+        return found
+
+
+@pytest.fixture(params=["virtual", "real"])
+def clients(request):
+    """Two clients, the initiator first; test_boards.py tests the effects of a terminal on bytes."""
+    with two_ports(request.param) as (ports, _):
+        yield [Client(port, seed) for seed, port in enumerate(ports, 1)]
+
+
+def board_id(client):
+    return Board(client.transport, answer_s=TIMEOUT_S).id
+
+
+@pytest.mark.slow
+def test_nine_of_ten_impulse_responses_reach_both_ends(clients):
+    """Real boards with the firmware: 91 of 100."""
+    one, two = clients
+    target = board_id(two)
+    got = {one: 0, two: 0}
+    for _ in range(100):
+        one.write(b"C05|%d|1|1|1\r" % target)
+        for client in got:
+            found = []
+            for _ in range(3):
+                found += client.messages()
+                if any(isinstance(e, m.Cir) for e in found):
+                    break
+            got[client] += any(isinstance(e, m.Cir) for e in found)
+        for client in got:
+            client.messages(0.02)
+    assert min(got.values()) >= 90, got.values()
+
+
+def test_a_scan_of_ids_finds_the_boards(clients):
+    one, two = clients
+    mine, other = board_id(one), board_id(two)
+    found = []
+    for number in range(11):
+        one.write(b"C05|%d|0|1|0\r" % number)
+        reports = [e for e in one.messages() if isinstance(e, m.RangeReport)]
+        found += [number for report in reports if report.neighbour == number]
+    assert other in found
+    assert mine not in found

@@ -25,6 +25,11 @@ def said(ports, tag, start=b""):
     return [(t / NS_PER_MS, data) for t, who, data in ports.transfers if who == tag and data.startswith(start)]
 
 
+@pytest.fixture
+def ports():
+    return VirtualPorts(bench_scenario())
+
+
 def range_often(ports, command, count, listening=()):
     """Range every 70 ms: six failing tries take 43 ms."""
     passive = [(0, tag, b"C04|1\r") for tag in listening]
@@ -69,9 +74,8 @@ def sent_frames(ports):
     return frames
 
 
-def test_a_target_that_starts_ranging_sends_no_delayed_reply():
+def test_a_target_that_starts_ranging_sends_no_delayed_reply(ports):
     """The command comes within the delay of its reply, 6 ms here; without target reports the board accepts it."""
-    ports = VirtualPorts(bench_scenario())
     frames, asked = sent_frames(ports), b"C05|2|0|1|0\r"
     # Both try without success for a while, because each blocks the other.
     played((0, 2, b"C08|6000\r"), (5, 1, asked), (7.5, 2, b"C05|3|0|1|0\r"), until_ms=80, ports=ports)
@@ -81,8 +85,7 @@ def test_a_target_that_starts_ranging_sends_no_delayed_reply():
     assert len(said(ports, 1, b"R05")) == 1
 
 
-def test_a_report_is_lost_while_the_bus_is_busy():
-    ports = VirtualPorts(bench_scenario())
+def test_a_report_is_lost_while_the_bus_is_busy(ports):
     board = ports.bench.boards[1]
     for delay in (1 * NS_PER_US, 50 * NS_PER_US, 200 * NS_PER_US):
         board.usb.send(b"%d" % delay + bytes(100), delay)
@@ -91,8 +94,7 @@ def test_a_report_is_lost_while_the_bus_is_busy():
     assert [data.rstrip(b"\0") for _, data in said(ports, 1)] == [b"1000", b"200000"]
 
 
-def test_impulse_responses_follow_reports_by_four_to_six_milliseconds():
-    ports = VirtualPorts(bench_scenario())
+def test_impulse_responses_follow_reports_by_four_to_six_milliseconds(ports):
     range_often(ports, b"C05|2|1|1|1\r", 40)
     after = [b[0] - a[0] for a, b in zip(said(ports, 1, b"R05"), said(ports, 1, b"S10"), strict=True)]
     assert 3.8 <= min(after) < 4.3
@@ -100,9 +102,8 @@ def test_impulse_responses_follow_reports_by_four_to_six_milliseconds():
     assert [data[:3] for _, data in said(ports, 2) if data[:3] in (b"S10", b"S05")] == [b"S10", b"S05"] * 40
 
 
-def test_passive_boards_print_zeros_for_tries_that_fail_and_others_warn():
+def test_passive_boards_print_zeros_for_tries_that_fail_and_others_warn(ports):
     """The target is absent: six tries, of which a listener receives only the poll."""
-    ports = VirtualPorts(bench_scenario())
     range_often(ports, b"C05|9|0|1|0\r", 5, listening=[3])
     assert len(said(ports, 1, b"COMMANDED")) == 5
     zeros = said(ports, 3, b"S01|1|9|0|")
@@ -120,8 +121,7 @@ def test_failed_tries_make_bystanders_warn():
     assert Counter(data[:11] for _, data in said(ports, 3)) == {b"WARNING 0xB": 6}
 
 
-def test_a_listener_that_misses_the_last_frame_is_deaf_until_another_comes():
-    ports = VirtualPorts(bench_scenario())
+def test_a_listener_that_misses_the_last_frame_is_deaf_until_another_comes(ports):
     bench, send = ports.bench, ports.bench.air.send
 
     def losing(*sent):

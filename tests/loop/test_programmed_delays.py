@@ -11,9 +11,7 @@ import pytest
 import calib
 import uwblink
 import uwbsim
-from calib.errors import BadInputError
 from tests.processes import refuse, run, succeed
-from uwblink.errors import PlanError
 from uwblink.importers import add_poses
 from uwblink.recording import load_antenna_delays
 from uwbsim.scenario import with_antenna_delays
@@ -167,14 +165,14 @@ def test_stamps_are_those_of_the_firmware(tmp_path, protocol, through):
 
 def test_recordings_require_the_programmed_delays(loop, tmp_path):
     world = scenario(DELAYS_NS)
-    with pytest.raises(PlanError, match=r"board 1.*16436"):
+    with pytest.raises(uwblink.errors.PlanError, match=r"board 1.*16436"):
         record(world, tmp_path / "f.uwb", loop / "firmware.toml", said=False)
     assert not list(tmp_path.glob("f.uwb*"))
     (tmp_path / "some.toml").write_text("\n".join((loop / "firmware.toml").read_text().split("\n\n")[:2]))
-    with pytest.raises(PlanError, match="board 3, 4"):
+    with pytest.raises(uwblink.errors.PlanError, match="board 3, 4"):
         record(world, tmp_path / "f.uwb", tmp_path / "some.toml")
     (tmp_path / "unclear.toml").write_text("[antenna_delays]\ntx = 16446\nrx = 16449\n")
-    with pytest.raises(PlanError, match=r"unclear\.toml: antenna_delays\.reply"):
+    with pytest.raises(uwblink.errors.PlanError, match=r"unclear\.toml: antenna_delays\.reply"):
         load_antenna_delays(tmp_path / "unclear.toml")
 
 
@@ -193,7 +191,7 @@ def test_calibrations_with_other_programmed_delays_have_warnings(loop, tmp_path)
         assert "tag 1" not in run(*own, "--force").stderr
     assert "tag 1: 16436/16436 then" in run("calib", "localize", second, "-c", first).stderr
     refuse("calib", "export", first, "--to", "registers", "--antenna-delays", second, naming=["--antenna-delays"])
-    with pytest.raises(BadInputError, match=r"second\.uwb: tag 1"):
+    with pytest.raises(calib.BadInputError, match=r"second\.uwb: tag 1"):
         calib.load_ranges([loop / "first.uwb", second])
 
 

@@ -16,7 +16,6 @@ from scipy.interpolate import BSpline
 import calib
 import uwblink
 import uwbsim
-from calib.calibration.model import load_calibration
 from calib.surveys.knowledge import load_knowledge
 from tests import pages, processes
 from tests.shared_data import ROOT
@@ -87,7 +86,7 @@ def done(tmp_path_factory):
 
 def errors_ns(path):
     """Return errors of delays against planted values, and their covariance, in order of tags."""
-    found = load_calibration(path)
+    found = calib.load_calibration(path)
     error = np.array([found.delays_ns[tag] - planted for tag, planted in PLANTED.items()])
     return error, np.array(found.uncertainty.delays_ns2)
 

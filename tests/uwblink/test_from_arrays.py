@@ -24,14 +24,6 @@ def test_ranges_without_stamps_are_those_of_a_table_without_stamps(tmp_path):
     )
     for name in COLUMNS:
         np.testing.assert_array_equal(getattr(mine, name), getattr(table, name), err_msg=name)
-    cases: tuple[tuple[dict[str, Any], str], ...] = (
-        ({"tx1": [3], "range_m": [3.1]}, "rx1: is missing"),
-        ({"rx1": [3], "range_m": [3.1]}, "tx1: is missing"),
-        ({}, "tx1: is missing; give the stamps, or range_m"),
-    )
-    for columns, said in cases:
-        with pytest.raises(ArgumentError, match=said):
-            Exchanges.from_arrays(1, 2, **columns)
 
 
 def test_one_value_applies_to_all_rows_and_whole_floats_are_accepted():
@@ -46,8 +38,12 @@ def test_stamps_that_a_protocol_has_not_are_zero_and_mixed_protocols_keep_theirs
 
 
 @pytest.mark.parametrize(
-    ("change", "expected"),
+    ("columns", "expected"),
     [
+        ({"target": 2, "tx1": [3], "range_m": [3.1]}, "rx1: is missing"),
+        ({"target": 2, "rx1": [3], "range_m": [3.1]}, "tx1: is missing"),
+        ({}, "tx1: is missing; give the stamps, or range_m"),
+        *((SS | change, expected) for change, expected in (
         ({"rx2": [1, 2, 3]}, "rx2: found 3 rows, expected 2 as in the first column"),
         ({"tx1": [[1, 2]]}, r"tx1: found an array of shape \(1, 2\), expected one value a row"),
         ({"tx1": 5}, r"tx1: found an array of shape \(\), expected one value a row"),
@@ -68,13 +64,14 @@ def test_stamps_that_a_protocol_has_not_are_zero_and_mixed_protocols_keep_theirs
         ({"fpp1_dbm": [-80, np.inf]}, "fpp1_dbm: row 1: found inf, expected a finite number, or NaN"),
         ({"fpp1_dbm": ["a", "b"]}, "fpp1_dbm: found 'a' .*, expected numbers"),
         ({"time_ns": 2**63}, "time_ns: row 0: found 9223372036854775808, expected a whole number from"),
+        )),
     ],
 )  # fmt: skip
-def test_mistakes_name_column_row_and_what_is_expected(change, expected):
+def test_mistakes_name_column_row_and_what_is_expected(columns, expected):
     assert issubclass(ArgumentError, ValueError)
     assert issubclass(ArgumentError, UwblinkError)
     with pytest.raises(ArgumentError, match=rf"\A.*({expected}).*\Z"):
-        Exchanges.from_arrays(**({"initiator": 1, "target": [2, 3]} | SS | change))
+        Exchanges.from_arrays(**({"initiator": 1, "target": [2, 3]} | columns))
 
 
 def test_exchanges_are_made_by_name_only():

@@ -15,13 +15,12 @@ import uwblink
 import uwbsim
 from tests import processes
 from tests.boards import served
-from tests.processes import BIN, wait_until
 from tests.shared_data import ROOT
 
 
 def started(*words):
     environment = os.environ | {"PYTHONFAULTHANDLER": "1"}
-    command = [str(BIN / words[0]), *words[1:]]
+    command = [str(processes.BIN / words[0]), *words[1:]]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 
 
@@ -68,7 +67,7 @@ def test_a_sweep_says_that_what_was_done_is_kept_and_goes_on_with_it(tmp_path):
     plan, results = tmp_path / "sweep.toml", tmp_path / "results"
     plan.write_text(re.sub(r"(?m)^seeds = .*$", "seeds = 400", text))
     process = started("uwbsim", "sweep", str(plan), "-o", str(results), "--workers", "1")
-    wait_until(lambda: (results / "results.duckdb.wal").exists() or len(files(results)) > 0, process)
+    processes.wait_until(lambda: (results / "results.duckdb.wal").exists() or len(files(results)) > 0, process)
     out, _ = ended(process)
     assert process.returncode == 130
     assert "interrupted; finished runs are kept, and --resume continues" in out
@@ -86,7 +85,7 @@ def flight(tmp_path_factory):
 @pytest.mark.slow
 def test_an_interrupted_report_is_reported_and_leaves_no_partial_file(flight, tmp_path):
     process = started("calib", "report", str(flight), "-o", str(tmp_path / "page.html"))
-    wait_until(lambda: is_working(process), process)
+    processes.wait_until(lambda: is_working(process), process)
     time.sleep(1.0)
     _, err = ended(process)
     # On a fast machine it may have ended before.
@@ -103,7 +102,7 @@ def test_an_interrupted_import_prints_one_line_and_leaves_no_file(tmp_path):
         file.write("time_s,from_id,to_id,range_m,fpp1,fpp2\n")
         file.writelines(row.format(k, k % 5, 3.25 + k % 7) for k in range(1_200_000))
     process = started("uwblink", "import", "csv", str(tmp_path / "t.csv"), "-o", str(tmp_path / "t.uwb"))
-    wait_until(lambda: is_working(process), process)
+    processes.wait_until(lambda: is_working(process), process)
     time.sleep(0.2)
     _, err = ended(process)
     # On a fast machine it may have ended before.
@@ -125,9 +124,13 @@ def test_a_terminated_writer_leaves_no_file(long, tmp_path, words, number):
     folder = long.parent / f"{tmp_path.name}"
     folder.mkdir()
     process = subprocess.Popen(
-        [str(BIN / words[0]), *words[1:]], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        [str(processes.BIN / words[0]), *words[1:]],
+        cwd=folder,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
     )
-    wait_until(lambda: any(folder.iterdir()), process, step_s=0.002)
+    processes.wait_until(lambda: any(folder.iterdir()), process, step_s=0.002)
     _, err = ended(process, number)
     assert ((process.returncode, err), list(folder.iterdir())) == ((130, "interrupted\n"), [])
 

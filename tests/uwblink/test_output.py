@@ -13,9 +13,10 @@ from uwblink.output import check_apart, write_bytes, write_files, write_text
 from uwblink.text_files import read_text
 
 
-def test_text_is_utf8_and_no_temporary_file_remains(tmp_path):
+def test_text_is_utf8_and_read_as_it_was_written_and_no_temporary_file_remains(tmp_path):
     write_text(tmp_path / "a.txt", "± 1 µs\n", force=False)
     assert (tmp_path / "a.txt").read_bytes() == "± 1 µs\n".encode()
+    assert read_text(tmp_path / "a.txt", ValueError) == "± 1 µs\n"
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
 
@@ -73,11 +74,6 @@ def test_unreadable_text_files_are_one_line(tmp_path, name, line):
     with pytest.raises(ImportTableError, match=one_line(line)) as found:
         read_text(str(tmp_path / name), ImportTableError, "map")
     assert "\0" not in str(found.value)
-
-
-def test_text_is_read_as_it_was_written(tmp_path):
-    (tmp_path / "text").write_text("µ\n", encoding="utf-8")
-    assert read_text(tmp_path / "text", ValueError) == "µ\n"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

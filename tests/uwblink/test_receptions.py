@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import uwbsim
-from uwblink import raw_range
-from uwblink.errors import ArgumentError
+from uwblink import errors, raw_range
 from uwblink.receptions import Receptions, contradicted, exchanges_in, times_by_stamps
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 
@@ -133,7 +132,7 @@ def test_times_are_those_of_the_clocks_that_stamped_last():
 
 
 def test_wrong_receptions_are_refused():
-    with pytest.raises(ArgumentError, match="listener: row 1"):
+    with pytest.raises(errors.ArgumentError, match="listener: row 1"):
         Receptions.from_arrays([0, 1], [1, 2], [2, 2], tx=0, rx=1)
-    with pytest.raises(ArgumentError, match="2 receptions contain no exchange"):
+    with pytest.raises(errors.ArgumentError, match="2 receptions contain no exchange"):
         exchanges_in(Receptions.from_arrays([0, 1], [1, 2], [2, 1], tx=[0, 9], rx=[5, 20]))

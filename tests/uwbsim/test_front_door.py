@@ -1,18 +1,14 @@
 import re
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import typer
 
 import uwbsim
 from uwblink import Recording
-from uwblink.cli.shared import with_flags
 from uwblink.database import write_tables
 from uwblink.twr import COLUMNS
-from uwbsim.cli.commands import UWBSIM_FLAGS, app
 
 NOISELESS = Path(__file__).parents[2] / "scenarios" / "noiseless.toml"
 SHORT = {"run.duration_s": 2.0}
@@ -29,21 +25,6 @@ def test_a_scenario_is_a_file_a_text_tables_or_itself():
         for name in COLUMNS:
             np.testing.assert_array_equal(getattr(flight.exchanges, name), getattr(flights[0].exchanges, name))
     assert uwbsim.load(str(NOISELESS), SHORT) == uwbsim.load(NOISELESS, ["run.duration_s=2.0"]) == loaded
-
-
-@pytest.mark.parametrize(
-    ("source", "overrides", "message"),
-    [
-        ("run = {\n", (), r"^scenario: not valid TOML"),
-        ({"ranging": {"rate_hz": 1.0}}, (), r"^scenario: run: missing"),
-        ("nowhere.toml", (), r"nowhere\.toml: no such scenario file"),
-        (NOISELESS, ["run"], r"^`overrides`: found 'run' *, expected key"),
-        (NOISELESS, {"run.seed.x": 1}, r"^run\.seed\.x: seed is not a table"),
-    ],
-)
-def test_errors_in_scenarios_name_the_place(source, overrides, message):
-    with pytest.raises(uwbsim.ScenarioError, match=message):
-        uwbsim.simulate(uwbsim.load(source, overrides))
 
 
 def test_a_notebook_shows_the_tags_of_a_scenario():
@@ -100,25 +81,3 @@ def test_tables_that_fail_half_way_leave_what_was_there(tmp_path):
         write_tables(table, parquet, Failing(), force=True)
     assert (table.read_bytes(), parquet.read_bytes()) == before
     assert sorted(file.name for file in tmp_path.iterdir()) == ["t.csv", "t.parquet"]
-
-
-# Errors of uwbsim name parameters, and its command line the flags for them.
-
-
-ROOT = NOISELESS.parents[1]
-COMMANDS: Any = typer.main.get_command(app)
-OPTIONS = {"/".join(p.opts) for command in COMMANDS.commands.values() for p in command.params}
-# Of functions that no command calls with values of a user.
-ONLY_FROM_PYTHON = {"effect", "source", "name", "evaluate", "lost_share"}
-
-
-def test_every_parameter_that_an_error_names_has_its_flag():
-    named = set()
-    for path in (ROOT / "uwbsim").rglob("*.py"):
-        named |= set(re.findall(r'parameter="([a-z_0-9]+)"', path.read_text()))
-    assert {"count", "overrides", "overhead_s", "workers"} <= named
-    assert {with_flags(f"`{name}`", UWBSIM_FLAGS) for name in named - ONLY_FROM_PYTHON} <= OPTIONS
-
-
-def test_every_number_of_a_state_has_its_flag():
-    assert {with_flags(f"`{name}`", UWBSIM_FLAGS) for name in uwbsim.State.__dataclass_fields__} <= OPTIONS

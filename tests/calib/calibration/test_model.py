@@ -93,9 +93,33 @@ def test_factors_of_a_pair_hold_in_both_directions(fitted, name):
     assert there / (1 - there) == pytest.approx(3 * other / (1 - other))
 
 
-def test_a_tag_in_no_group_is_named(fitted):
-    with pytest.raises(calib.BadInputError, match="tag 7 is in none"):
-        replace(fitted, groups={"a": TagGroup((1, 2, 3), fitted.bias_curve, fitted.sigma_curve)}).apply(ranges(10))
+def of_three(known):
+    """Return a calibration with a group without tag 7."""
+    return replace(known, groups={"a": TagGroup((1, 2, 3), known.bias_curve, known.sigma_curve)})
+
+
+@pytest.mark.parametrize(
+    ("use", "error", "said"),
+    [
+        (lambda known: of_three(known).apply(ranges(10)), calib.BadInputError, "tag 7 is in none"),
+        (
+            lambda known: calib.compare(known, replace(known, delays_ns={99: 0.0})),
+            calib.UnanswerableError,
+            "0 tags have determined delays in both",
+        ),
+        *(
+            (
+                lambda known, shares=shares: known.quantiles(ranges(10), shares),
+                calib.BadInputError,
+                r"`shares`: .*between 0 and 1",
+            )
+            for shares in ([], [0.0], [1.2], [[0.5]])
+        ),
+    ],
+)
+def test_what_a_calibration_cannot_be_used_for_is_named(fitted, use, error, said):
+    with pytest.raises(error, match=said):
+        use(fitted)
 
 
 SLOPE = '{"tags": [%d], "m_per_k": 0.002, "std_m_per_k": 0.0, "reference_c": 25.0, "span_c": [20, 30]}'
@@ -305,24 +329,46 @@ def test_error_models_are_read_unchanged_and_may_be_missing(error_fitted):
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "said"),
+    ("path", "value", "said"),
     [
-        ("lifted", [0.1], "errors: lifted"),
-        ("noise_m", [0.0] * 8, "errors: noise_m: 0: .*above 0"),
-        ("noise_m", [1.0] * 7, "errors: lifted"),
-        ("tail_share", [1.5] * 8, "errors: tail_share: 0"),
-        ("pairs", {"one-two": {}}, "names of pairs"),
-        ("pairs", {"1-2": {"noise": 1.0, "odds": 0.0, "detour": 1.0}}, "1-2: odds"),
-        ("levels", [[0.1]], "levels"),
-        ("scale", "wide", "scale"),
-        ("long_share", 1.5, "long_share"),
+        ("speed_of_light", 0, "speed_of_light"),
+        ("speed_of_light", 3e5, "speed_of_light"),
+        ("delays_ns/2", 9.2e18, "delays_ns"),
+        ("delays_ns/2", 10**400, "delays_ns"),
+        ("delays_ns/2", None, "delays_ns"),
+        ("delays_ns/" + "9" * 5000, 0.1, "delays_ns"),
+        ("delays_std_ns/2", -0.05, "delays_std_ns"),
+        ("delays_std_ns/2", 9.2e18, "delays_std_ns"),
+        ("scale_ns", -1.0, "scale_ns"),
+        ("alpha_dbm", 4000.0, "alpha_dbm"),
+        ("bias_curve/coefficients/0", 1e30, "bias_curve"),
+        ("sigma_curve/coefficients/0", -0.5, "sigma_curve"),
+        ("errors/lifted", [0.1], "errors: lifted"),
+        ("errors/noise_m", [0.0] * 8, "errors: noise_m: 0: .*above 0"),
+        ("errors/noise_m", [1.0] * 7, "errors: lifted"),
+        ("errors/tail_share", [1.5] * 8, "errors: tail_share: 0"),
+        ("errors/pairs", {"one-two": {}}, "names of pairs"),
+        ("errors/pairs", {"1-2": {"noise": 1.0, "odds": 0.0, "detour": 1.0}}, "1-2: odds"),
+        ("errors/levels", [[0.1]], "levels"),
+        ("errors/levels/0/0", 2.0, "levels"),
+        ("errors/scale", "wide", "scale"),
+        ("errors/scale", 0.0, "scale"),
+        ("errors/outlier_share", 1.5, "outlier_share"),
+        ("errors/outlier_m", -3.0, "outlier_m"),
+        ("errors/detour_m", -0.1, "detour_m"),
+        ("errors/long_share", 1.5, "long_share"),
+        ("uncertainty/delays_ns2/0/0", -0.01, "uncertainty"),
+        ("uncertainty/bias_m2", [[1.0]], "uncertainty"),
     ],
 )
-def test_a_damaged_model_is_one_clear_error(error_fitted, key, value, said):
-    document = json.loads(error_fitted.to_json())
-    document["errors"][key] = value
-    with pytest.raises(calib.BadInputError, match=said):
-        Calibration.from_json(json.dumps(document), "here")
+def test_impossible_values_in_files_are_refused_by_name(error_fitted, path, value, said):
+    table = inner = json.loads(error_fitted.to_json())
+    *outer, last = path.split("/")
+    for key in outer:
+        inner = inner[int(key) if isinstance(inner, list) else key]
+    inner[int(last) if isinstance(inner, list) else last] = value
+    with pytest.raises(calib.BadInputError, match=f"(?s)^here: .*{said}"):
+        Calibration.from_json(json.dumps(table), "here")
 
 
 def test_a_fit_estimates_the_persistence_of_errors():
@@ -355,12 +401,6 @@ def test_a_fit_estimates_the_duration_of_reflections(renewal_s):
     assert found == pytest.approx(renewal_s, rel=0.4, abs=0.03)
 
 
-@pytest.mark.parametrize("shares", [[], [0.0], [1.2], [[0.5]]])
-def test_quantiles_refuse_wrong_shares(error_fitted, shares):
-    with pytest.raises(calib.BadInputError, match=r"`shares`: .*between 0 and 1"):
-        error_fitted.quantiles(calib.load_ranges(calib.sample_flight()), shares)
-
-
 # Comparison of two calibrations.
 
 
@@ -391,11 +431,6 @@ def test_a_common_shift_of_delays_and_curve_is_no_difference(fitted):
     assert found.same
     assert [found.offset_m, found.curve_rms_m] == pytest.approx([0, 0], abs=1e-9)
     assert np.abs(list(found.difference_ns.values())).max() < 1e-9
-
-
-def test_calibrations_without_common_tags_are_not_compared(fitted):
-    with pytest.raises(calib.UnanswerableError, match="0 tags have determined delays in both"):
-        calib.compare(fitted, replace(fitted, delays_ns={99: 0.0}))
 
 
 @pytest.mark.slow

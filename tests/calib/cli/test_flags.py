@@ -1,50 +1,21 @@
 """The command line names options instead of parameters, and derives the options of a fit from its settings."""
 
 import json
-import re
+import operator
 from dataclasses import fields
-from typing import Any
 
 import numpy as np
 import pytest
-import typer
 
 import calib
 from calib.calibration.power_curves import ALPHA_DBM, LIFTS
-from calib.cli.commands import app
 from calib.cli.shared import with_flags
 from calib.estimator import optimize
 from calib.settings import FitSettings, read_distances
-from docs.site.commands import leaves
 from tests import processes
 from tests.calib.plain_tables import DELAYS_NS, Plan, bias_m, write
 from tests.calib.trajectories.sines import flight
-from tests.processes import succeed as run
-from tests.shared_data import ROOT
 from uwblink import Contents, KnownDistance, Recording
-
-COMMANDS: Any = typer.main.get_command(app)
-OPTIONS = {o for _, command in leaves(COMMANDS, ("calib",)) for parameter in command.params for o in parameter.opts}
-# Without an option: the power of the lifting, equal for all calibrations, and parameters of functions only.
-ONLY_FROM_PYTHON = {
-    *("alpha_dbm", "data", "truth_m", "range_m", "target", "weights", "protocol", "name", "before", "section"),
-    *("shares", "start_m", "information", "loosest", "boards", "robots"),
-    # Named by the command itself, as its own option.
-    *("seconds", "speed_m_s", "apart_m", "still_s", "noise_m", "size_m", "rate_hz", "tape_sigma_m", "anchor_sigma_m"),
-    *("anchor_places", "reference"),
-    # Parts of the errors of ranges and of differences of arrival.
-    *("side", "odds"),
-    # Parameters of ranges from arrays.
-    *("features", "temperature_c"),
-}
-
-
-def test_parameters_in_errors_have_options():
-    named = set()
-    for path in (ROOT / "calib").rglob("*.py"):
-        named |= set(re.findall(r'(?:parameter=|check_choice\()"([a-z_0-9]+)"', path.read_text()))
-    assert {"fixed_ns", "groups", "loss", "tag", "to"} <= named
-    assert {with_flags(f"`{name}`") for name in named - ONLY_FROM_PYTHON} <= OPTIONS
 
 
 def test_other_text_is_not_changed():
@@ -137,14 +108,14 @@ def test_contradicting_options_are_refused(recording, tmp_path, words, said):
 def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("ranges")
     write(place / "ranges.csv", Plan(bias=bias_m))
-    run("uwblink", "import", "csv", place / "ranges.csv", "-o", place / "ranges.uwb")
+    processes.succeed("uwblink", "import", "csv", place / "ranges.csv", "-o", place / "ranges.uwb")
     return place
 
 
 @pytest.fixture(scope="module")
 def fitted(folder):
     """Return the output of the command that writes c.json."""
-    return run("calib", "fit", folder / "ranges.uwb", "-o", folder / "c.json")
+    return processes.succeed("calib", "fit", folder / "ranges.uwb", "-o", folder / "c.json")
 
 
 @pytest.mark.slow
@@ -156,29 +127,39 @@ def test_import_curve_localization(folder, fitted):
         # Delays are stated for a curve that is zero at -82 dBm, so all are shifted equally.
         assert written["delays_ns"][str(tag)] - middle == pytest.approx(delay, abs=0.05)
     assert any("ranges without stamps" in warning for warning in written["provenance"]["warnings"])
-    assert "ranges without stamps" in run("calib", "show", folder / "c.json").stdout
+    assert "ranges without stamps" in processes.succeed("calib", "show", folder / "c.json").stdout
     (folder / "part.csv").write_text("\n".join((folder / "ranges.csv").read_text().splitlines()[:2000]) + "\n")
-    run("uwblink", "import", "csv", folder / "part.csv", "-o", folder / "part.uwb")
+    processes.succeed("uwblink", "import", "csv", folder / "part.csv", "-o", folder / "part.uwb")
     words = ("calib", "localize", folder / "part.uwb", "-c", folder / "c.json", "--seeds", 1, "--json")
-    located = json.loads(run(*words).stdout)
+    located = json.loads(processes.succeed(*words).stdout)
     assert located["summary"]["rmse_m"]["calibrated"] < 0.7 * located["summary"]["rmse_m"]["raw"]
-    run("calib", "apply", folder / "ranges.uwb", "-c", folder / "c.json", "--to", "csv", "-o", folder / "out")
+    processes.succeed(
+        "calib", "apply", folder / "ranges.uwb", "-c", folder / "c.json", "--to", "csv", "-o", folder / "out"
+    )
     corrected = np.genfromtxt(folder / "out" / "corrected.csv", delimiter=",", names=True, dtype=None, encoding=None)
     assert np.mean(corrected["sigma_m"]) == pytest.approx(0.04, rel=0.15)
-    judged = json.loads(run("calib", "evaluate", folder / "ranges.uwb", "-c", folder / "c.json", "--json").stdout)
+    judged = json.loads(
+        processes.succeed("calib", "evaluate", folder / "ranges.uwb", "-c", folder / "c.json", "--json").stdout
+    )
     # The planted noise is 4 cm.
     assert judged["overall"]["full"]["robust_std_m"] == pytest.approx(0.041, abs=0.004)
 
 
 @pytest.mark.usefixtures("fitted")
 def test_constants_of_pairs_by_commands(folder):
-    done = run("calib", "fit", folder / "ranges.uwb", "-o", folder / "p.json", "--constants", "pair", "--delays-only")
+    done = processes.succeed(
+        "calib", "fit", folder / "ranges.uwb", "-o", folder / "p.json", "--constants", "pair", "--delays-only"
+    )
     assert "pair    1-11" in done.stdout
     assert "delays only" in done.stderr
-    assert "constants of 12 pairs" in run("calib", "show", folder / "p.json").stdout
-    assert "between pairs" in run("calib", "evaluate", folder / "ranges.uwb", "-c", folder / "p.json").stdout
-    run("calib", "fit", folder / "ranges.uwb", "-o", folder / "q.json", "--delays-from", folder / "c.json")
-    shown = run("calib", "show", folder / "q.json").stdout
+    assert "constants of 12 pairs" in processes.succeed("calib", "show", folder / "p.json").stdout
+    assert (
+        "between pairs" in processes.succeed("calib", "evaluate", folder / "ranges.uwb", "-c", folder / "p.json").stdout
+    )
+    processes.succeed(
+        "calib", "fit", folder / "ranges.uwb", "-o", folder / "q.json", "--delays-from", folder / "c.json"
+    )
+    shown = processes.succeed("calib", "show", folder / "q.json").stdout
     assert "fitted: curve only" in shown
     assert "warning: curve only" in shown
 
@@ -187,9 +168,11 @@ def test_one_pair_is_evaluated_without_a_number_between_pairs(folder):
     head, *rows = (folder / "ranges.csv").read_text().splitlines()
     kept = [row for row in rows if sorted(row.split(",")[1:3], key=int) == ["1", "11"]]
     (folder / "one.csv").write_text("\n".join([head, *kept]) + "\n")
-    run("uwblink", "import", "csv", folder / "one.csv", "-o", folder / "one.uwb")
-    run("calib", "fit", folder / "one.uwb", "-o", folder / "one.json", "--constants", "pair", "--delays-only")
-    told = run("calib", "evaluate", folder / "one.uwb", "-c", folder / "one.json").stdout
+    processes.succeed("uwblink", "import", "csv", folder / "one.csv", "-o", folder / "one.uwb")
+    processes.succeed(
+        "calib", "fit", folder / "one.uwb", "-o", folder / "one.json", "--constants", "pair", "--delays-only"
+    )
+    told = processes.succeed("calib", "evaluate", folder / "one.uwb", "-c", folder / "one.json").stdout
     assert "are within pairs" in told
     assert "nan" not in told
 
@@ -228,5 +211,64 @@ def test_commands_warn_of_stopped_fits(stopped, stopped_flight, tmp_path):
         ("export", path, "--to", "csv"),
         ("compare", path, path),
     ):
-        assert "stopped before it converged" in run("calib", *words).stderr, words[0]
-    assert "NOT CONVERGED" in run("calib", "show", path).stdout
+        assert "stopped before it converged" in processes.succeed("calib", *words).stderr, words[0]
+    assert "NOT CONVERGED" in processes.succeed("calib", "show", path).stdout
+
+
+# Calibrations whose provenance is damaged: one line and status 2, or everything that does not need the entry.
+
+
+@pytest.fixture(scope="module")
+def document():
+    """The document of a survey of the tags of the sample."""
+    return json.loads(calib.survey(calib.sample_arrangements(), known="line").calibration.to_json())
+
+
+@pytest.mark.parametrize(
+    ("entry", "value"),
+    [
+        (("geometry",), None),
+        (("geometry", "freedom"), "many"),
+        (("geometry", "arrangements"), 3),
+        (("pairs",), None),
+        (("warnings",), 3),
+        (("findings",), [1, "x"]),
+        (("findings",), 3),
+        (("reflected",), [{"chance": "high"}]),
+        (("surveyed",), [{"name": 1}]),
+        (("undetermined",), [3]),
+        (("second_best",), "none"),
+    ],
+    ids=str,
+)
+def test_a_damaged_entry_is_one_line_where_it_is_used(document, tmp_path, entry, value):
+    processes.succeed("calib", "sample", "-o", tmp_path / "a.uwb", "-n", "900")
+    changed = json.loads(json.dumps(document))
+    table = changed["provenance"]
+    for key in entry[:-1]:
+        table = operator.getitem(table, key)
+    table[entry[-1]] = value
+    (tmp_path / "c.json").write_text(json.dumps(changed))
+    page = tmp_path / "r.html"
+    judged = processes.run("calib", "evaluate", tmp_path / "a.uwb", "-c", tmp_path / "c.json", "--report", page)
+    shown = processes.run("calib", "show", tmp_path / "c.json")
+    for done in (judged, shown):
+        assert "Traceback" not in done.stderr
+        assert done.returncode in (0, 2)
+        if done.returncode:
+            assert "its provenance is not as uwbcal writes it" in " ".join(done.stderr.split())
+    assert page.exists() == (judged.returncode == 0)
+
+
+def test_calibrations_of_version_0_2_are_read_by_the_old_names_of_keys(document):
+    older = {"geometry": "rests_on", "undetermined_text": "left_open"}
+    provenance = {older.get(key, key): value for key, value in document["provenance"].items()}
+    assert "rests_on" in provenance
+    known = calib.Calibration.from_json(json.dumps(document | {"provenance": provenance}))
+    assert known == calib.Calibration.from_json(json.dumps(document))
+
+
+def test_flat_curves_are_shown_at_one_power(document):
+    text = repr(calib.Calibration.from_json(json.dumps(document)))
+    (line,) = [line for line in text.splitlines() if line.startswith("  lifted power")]
+    assert len(line.removeprefix("  lifted power").split()) == 1

@@ -1,17 +1,20 @@
 """Sparse and dense linear algebra of the estimator give equal results."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from scipy import sparse
+from scipy import optimize, sparse
 
 import calib
 from benchmarks.worlds import FIRST_REPORTED, Recipe, make
 from calib.estimator import rows, unknowns
+from calib.estimator.grouped_errors import fit_grouped_errors
 from calib.estimator.inverse import SparseInverse, inverse_of, trace_of_product
 from calib.estimator.known_distances import fit_known_distances
 from calib.estimator.optimize import maximize
-from calib.estimator.rows import NormalRows
-from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
+from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows
+from calib.estimator.rows import NormalRows, sum_rows
 from tests.calib.overhearing import flight
 
 
@@ -38,10 +41,10 @@ def test_a_search_ends_at_least_squares_and_finds_the_weight_of_its_prior(most, 
     rng = np.random.default_rng(1)
     seen = np.cumsum(rng.normal(0, 0.5, 200)) + rng.normal(0, 0.1, 200)
     steps = sparse.csr_matrix(np.eye(199, 200, 1) - np.eye(199, 200))
-    prior = Prior(weight=1.0, structure=sparse.csc_matrix(steps.T @ steps), rows=199, bounds=(1e-3, 1e3))
-    layout = Layout((Unknown(kind="path", names=("",) * 200, start=np.zeros(200), priors=(prior,)),))
+    prior = unknowns.Prior(weight=1.0, structure=sparse.csc_matrix(steps.T @ steps), rows=199, bounds=(1e-3, 1e3))
+    layout = unknowns.Layout((unknowns.Unknown(kind="path", names=("",) * 200, start=np.zeros(200), priors=(prior,)),))
     every = NormalRows(value=seen, std=np.full(200, 0.1), entries=np.ones((200, 1)), columns=np.arange(200)[:, None])
-    priors = Priors(layout)
+    priors = unknowns.Priors(layout)
     found = maximize([every], priors, layout.start(), tolerance=1e-6)
     assert found.success
     assert priors.deviation("path") == pytest.approx(0.5, rel=0.15)
@@ -72,9 +75,102 @@ def test_a_search_ends_at_one_optimum_of_unknowns_and_weights(data):
         weights = [w if prior.bounds is None else w * np.exp(rng.normal()) for w, (_, prior) in known]
         # Starts differ by a standard error, in logarithms by a half at most: farther away, there may be other optima.
         away = np.minimum(np.sqrt(np.diag(np.asarray(optimum.covariance))), 0.5) * rng.normal(size=len(optimum.x))
-        again = maximize(rows, Priors(optimum.layout, weights), optimum.x + away, asked=asked)
+        again = maximize(rows, unknowns.Priors(optimum.layout, weights), optimum.x + away, asked=asked)
         assert again.success
         assert again.steps < 25
         # A search ends if a step gains less than 0.01 in log likelihood, at most a tenth of a standard error, for both
         # searches.
         assert np.abs((again.of("delay") - optimum.of("delay")) / std).max() < 0.2
+
+
+# Errors of groups divided into noise, reflections and outliers, and the mean information of ranges by the model.
+
+
+def mixed(n=40_000, share=0.12, mean_m=0.35, outlier=0.0, seed=3):
+    rng = np.random.default_rng(seed)
+    sigma = np.array([0.06, 0.12])[np.arange(n) % 2]
+    error = 0.03 + rng.normal(size=n) * sigma + np.where(rng.random(n) < share, rng.exponential(mean_m, n), 0)
+    error = np.where(rng.random(n) < outlier, rng.uniform(-40, 40, n), error)
+    return [error[::2], error[1::2]]
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [{}, {"outlier": 0.03}, {"share": 0.0}, {"mean_m": 1.0}],
+    ids=["one kind", "outliers", "no reflections", "long detours"],
+)
+def test_the_parts_of_errors_are_found(planted):
+    found = fit_grouped_errors(mixed(**planted))
+    # 20,000 errors determine the centre to 0.6 and 1.2 mm and a sigma to 0.5 %; three times that are allowed.
+    np.testing.assert_allclose(found.centre_m, 0.03, atol=0.0035)
+    np.testing.assert_allclose(found.sigma_m, [0.06, 0.12], rtol=0.02)
+    share = planted.get("share", 0.12)
+    np.testing.assert_allclose(found.reflected, share, atol=0.012 if "outlier" not in planted else 0.02)
+    # Planted outliers are spread over 80 m, those of the model over 10 m.
+    np.testing.assert_allclose(found.outliers, planted.get("outlier", 0.0), atol=0.012)
+    if share and "outlier" not in planted:
+        np.testing.assert_allclose(found.detour_m, planted.get("mean_m", 0.35), rtol=0.06)
+    assert (found.centre_m - 0.03) / found.centre_std_m == pytest.approx([0, 0], abs=3)
+
+
+def test_groups_with_different_noise_are_separate():
+    rng = np.random.default_rng(7)
+    found = fit_grouped_errors([sigma * rng.normal(size=20_000) + k for k, sigma in enumerate((0.02, 0.2, 0.2))])
+    np.testing.assert_allclose(found.sigma_m, [0.02, 0.2, 0.2], rtol=0.02)
+    np.testing.assert_allclose(found.centre_m, [0, 1, 2], atol=0.005)
+
+
+VALUES = {"noise": np.log(0.04), "odds": -2.0, "detour": np.log(0.3), "least": np.log(0.02), "outliers": -8.0}
+
+
+@pytest.mark.parametrize("spread_m", [0.03, pytest.param(100.0, marks=pytest.mark.slow)])
+def test_noise_is_that_of_restricted_likelihood_however_many_offsets_there_are(spread_m):
+    # Six ranges for each of 100 offsets; without a prior this is the pooled variance, else an analysis of variance.
+    rng = np.random.default_rng(4)
+    offset, noise = 0.03 * rng.normal(size=(100, 1)), 0.05 * rng.normal(size=(100, 6))
+    group, error = np.repeat(np.arange(100), 6), (offset + noise).ravel()
+    blocks = [
+        unknowns.Unknown(kind=kind, names=("",), start=np.array([at]), known=np.array([kind != "noise"]))
+        for kind, at in (VALUES | {"long": -30.0, "odds": -40.0, "outliers": -40.0, "noise": -5.0}).items()
+    ]
+    prior = unknowns.Prior.of_deviation(spread_m)
+    blocks.append(unknowns.Unknown(kind="offset", names=("",) * 100, start=np.zeros(100), priors=(prior,)))
+    parts = [Part(parameter=b.kind, kind=b.kind, columns=np.zeros((1, 1), dtype=np.int64)) for b in blocks[:-1]]
+    parts.append(Part(parameter=RESIDUAL, kind="offset", columns=group[:, None], values=np.full((600, 1), -1.0)))
+    layout = unknowns.Layout(tuple(blocks))
+    rows = RangeRows.of(error, group, parts, Mixture(restricted=True), layout)
+    found = maximize([rows], unknowns.Priors(layout), layout.start(), evidence_steps=60)
+    within = float(np.mean(np.var(error.reshape(100, 6), axis=1, ddof=1)))
+    means = error.reshape(100, 6).mean(axis=1)
+
+    def unlikely(log_noise):
+        noise_m2 = np.exp(2 * log_noise)
+        between = spread_m**2 + noise_m2 / 6
+        return 500 * log_noise + 250 * within / noise_m2 + np.sum(np.log(between) + means**2 / between) / 2
+
+    best = optimize.minimize_scalar(unlikely, bounds=(-5, -1), method="bounded").x
+    assert found.of("noise")[0] == pytest.approx(best, abs=0.005)
+    assert np.exp(best) == pytest.approx(0.05, rel=0.08)
+    # The joint likelihood gives a smaller value, by up to a tenth.
+    assert maximize([rows], unknowns.Priors(layout), layout.start(), evidence_steps=0).of("noise")[0] < best - 0.03
+
+
+def test_noise_accounts_for_other_unknowns():
+    rng = np.random.default_rng(1)
+    kinds = VALUES | {"long": -30.0, RESIDUAL: 0.0}
+    layout = unknowns.Layout(
+        tuple(unknowns.Unknown(kind=kind, names=("",), start=np.array([at])) for kind, at in kinds.items())
+    )
+    count, one = 40_000, np.zeros((1, 1), dtype=np.int64)
+    reflected = rng.random(count) < 1 / (1 + np.exp(2.0))
+    error = 0.04 * rng.normal(size=count) + reflected * (0.02 + rng.exponential(0.3, count))
+    parts = [Part(parameter=kind, kind=kind, columns=one) for kind in kinds]
+    rows = RangeRows.of(error, np.zeros(count, dtype=np.int64), parts, Mixture(), layout)
+    noise = rows.values(layout.start(), ("noise",))["noise"]
+    plain, used = (
+        sum_rows([replace(rows, unsure_m2=share * np.exp(2 * noise))], layout.start()).gradient[
+            layout.where["noise"].start
+        ]
+        for share in (0.0, 0.1)
+    )
+    assert used - plain == pytest.approx(0.1 * len(rows))

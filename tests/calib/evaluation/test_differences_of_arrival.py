@@ -10,8 +10,7 @@ from scipy.interpolate import BSpline
 
 import calib
 from calib.data.sources import load_flight
-from calib.evaluation import Settings, localization_json, localization_text, summarize
-from calib.evaluation.filters import IMUS
+from calib.evaluation import IMUS, Settings, localization_json, localization_text, summarize
 from calib.evaluation.models import FilterRanges
 from calib.evaluation.tracking import problems, run_filters
 from tests import processes

@@ -7,13 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib import BadInputError, OnboardSettings, UnanswerableError, localize_onboard
+from calib.calibration import read_miluv
 from calib.calibration.error_model import ErrorModel
-from calib.calibration.formats import read_miluv
 from calib.calibration.patterns import Pattern
 from calib.data.samples import stamped
+from calib.evaluation import onboard_json, onboard_text, write_tum
 from calib.evaluation.filters import ProcessNoise, multilaterate
-from calib.evaluation.localization import write_tum
-from calib.evaluation.onboard import onboard_json, onboard_text
 from tests.calib import synthetic
 from tests.shared_data import miluv, shared
 from uwblink import Contents, Poses, Tag, raw_range

@@ -33,7 +33,6 @@ from calib.factors import Antenna, range_factor
 from calib.online import DelayStates, RangeUpdate, gated_update
 from tests.calib.evaluation import test_team
 from tests.calib.evaluation.drifting_flight import DELAYS_NS, LIGHT, PLACES, flight
-from tests.calib.evaluation.test_team import CLOSE, NOISE_M, PLANTED, ranging
 from tests.processes import refuse, succeed
 from tests.shared_data import ROOT
 
@@ -306,16 +305,18 @@ def test_the_average_over_models_has_the_moments_of_their_mixture():
 
 @pytest.mark.slow
 def test_a_team_follows_constants_of_pairs():
-    noise_m = float(np.hypot(NOISE_M, OFFSET_M))
+    noise_m = float(np.hypot(test_team.NOISE_M, OFFSET_M))
     errors = ErrorModel(lifted=(0.0,), noise_m=(noise_m,), tail_share=(1e-3,), least_m=0.0, detour_m=0.3,
                         outlier_share=0.0, outlier_m=0.0, between_m=OFFSET_M)  # fmt: skip
-    known, (_, ends, measured_m) = replace(PLANTED, errors=errors), ranging(10.0, 1)
+    known, (_, ends, measured_m) = replace(test_team.PLANTED, errors=errors), test_team.ranging(10.0, 1)
     made = test_team.flight(10.0)
     offsets_m = np.triu(np.random.default_rng(5).normal(0, OFFSET_M, (7, 7)))
     measured_m = measured_m + (offsets_m + offsets_m.T)[ends[:, 0], ends[:, 1]]
     exchanges = stamped(made.exchanges.time_ns, ends, measured_m, np.full((2, len(ends)), -85.0))
     made = replace(made, exchanges=exchanges)
-    own, fixed = ([one.tracks["robust"] for one in localize_team(made, by, CLOSE)] for by in (known, without(known)))
+    own, fixed = (
+        [one.tracks["robust"] for one in localize_team(made, by, test_team.CLOSE)] for by in (known, without(known))
+    )
     assert np.mean([one.rmse_m for one in own]) < 0.75 * np.mean([one.rmse_m for one in fixed])
     assert min(one.offsets[-1] for one in own) > 0.99
     assert consistency(own)[0] < 0.5 * consistency(fixed)[0]

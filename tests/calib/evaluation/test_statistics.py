@@ -9,7 +9,6 @@ from scipy.stats import norm
 import calib
 from calib.data.ranges import Ranges, concatenate
 from calib.evaluation import statistics
-from calib.evaluation.statistics import evaluate, split_error
 from calib.figures import errors_by_pair
 from tests import processes
 from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
@@ -35,7 +34,7 @@ def test_errors_are_split_into_within_and_between_pairs_and_sessions(pairs_m, se
             )
         )  # fmt: skip
     joined = concatenate(parts)
-    found = split_error(joined, joined.raw_m - joined.truth_m)
+    found = statistics.split_error(joined, joined.raw_m - joined.truth_m)
     assert found.sessions == 4
     assert found.within_m == pytest.approx(0.04, rel=0.15)
     assert found.between_pairs_m == pytest.approx(pairs_m, abs=0.015)
@@ -51,7 +50,7 @@ def test_evaluations_compare_with_planted_values():
     planted["bias_curve"] = {"knots": curve.t.tolist(), "coefficients": curve.c.tolist(), "degree": 3}
     r = replace(ranges(), planted=planted)
     calibration = calib.fit(r).calibration
-    found = evaluate(r, calibration).planted
+    found = statistics.evaluate(r, calibration).planted
     assert sum(found.delay_error_ns.values()) == pytest.approx(0, abs=1e-12)
     # A shift of the delays and a constant of the curve cancel here.
     moved = replace(
@@ -62,7 +61,7 @@ def test_evaluations_compare_with_planted_values():
             coefficients=tuple(c + 0.2e-9 * SPEED_OF_LIGHT for c in calibration.bias_curve.coefficients),
         ),
     )
-    again = evaluate(r, moved).planted
+    again = statistics.evaluate(r, moved).planted
     assert again.curve_rms_m == pytest.approx(found.curve_rms_m, abs=1e-9)
     assert again.correction_rms_m == pytest.approx(found.correction_rms_m, abs=1e-6)
     # The whole correction, by hand: raw minus truth without noise and tail.
@@ -80,7 +79,7 @@ def test_evaluations_compare_with_planted_values():
 @pytest.fixture(scope="module")
 def found():
     r = ranges(2000)
-    return evaluate(r, calib.fit(r).calibration)
+    return statistics.evaluate(r, calib.fit(r).calibration)
 
 
 def test_an_evaluation_prints_on_a_screen(found):

@@ -14,7 +14,6 @@ import calib
 import uwbsim
 from calib.calibration.patterns import Pattern
 from calib.data.samples import stamped
-from calib.errors import WeakHeadingWarning
 from calib.evaluation.filters import IMUS, ProcessNoise
 from calib.evaluation.team import team_json, team_text
 from tests import processes
@@ -333,7 +332,7 @@ def test_missing_sensors_are_named(change, settings, error, said):
 def test_a_body_with_one_tag_is_named():
     contents = flight(2.0)
     two = (contents.exchanges.initiator != 6) & (contents.exchanges.target != 6)
-    with pytest.warns(WeakHeadingWarning, match="memory: c has only one tag"):
+    with pytest.warns(calib.errors.WeakHeadingWarning, match="memory: c has only one tag"):
         found = calib.localize_team(replace(contents, exchanges=contents.exchanges[two]), PLANTED, CLOSE)
     assert found[1].tracks["variance"].rmse_m < 0.2
 

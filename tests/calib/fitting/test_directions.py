@@ -12,7 +12,6 @@ import pytest
 import calib
 import uwblink
 from benchmarks.directions import Recipe, flight, pattern_m
-from calib.errors import BadInputError, DirectionWarning, UnanswerableError
 from calib.report import Picture
 from calib.report.results import Results
 from calib.report.sections import SECTIONS
@@ -91,7 +90,7 @@ def test_another_flight_is_corrected_by_directions_from_its_poses(own, tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert uwblink.load(tmp_path / "c.uwb").exchanges.range_m == pytest.approx(known.apply(there).corrected_m, abs=1e-9)
     uwblink.Contents(exchanges=uwblink.load(second).exchanges).save(tmp_path / "blind.uwb")
-    with pytest.warns(DirectionWarning, match="^blind.uwb: 100 % of the ranges have no known direction"):
+    with pytest.warns(calib.errors.DirectionWarning, match="^blind.uwb: 100 % of the ranges have no known direction"):
         calib.apply(tmp_path / "blind.uwb", known, tmp_path / "d.uwb")
 
 
@@ -168,9 +167,9 @@ def test_a_pattern_that_attitudes_do_not_excite_is_refused_with_the_flight_that_
 
 def test_a_pattern_needs_directions_and_enough_ranges():
     flown_ranges = calib.load_ranges(flown(SHORT, 5)[0])
-    with pytest.raises(UnanswerableError, match="no directions are known"):
+    with pytest.raises(calib.UnanswerableError, match="no directions are known"):
         calib.fit(replace(flown_ranges, toward=np.full_like(flown_ranges.toward, np.nan)), pattern="shared")
-    with pytest.raises(UnanswerableError, match="too few ranges for a pattern; at least 960"):
+    with pytest.raises(calib.UnanswerableError, match="too few ranges for a pattern; at least 960"):
         calib.fit(flown_ranges[:300], pattern="tag")
     assert calib.fit(flown_ranges[:300]).calibration.patterns == ()
 
@@ -180,9 +179,9 @@ def test_a_pattern_needs_directions_and_enough_ranges():
     "settings", [{"sequential": True}, {"constants": "pair"}, {"use": "receptions"}], ids=lambda one: next(iter(one))
 )
 def test_fits_that_cannot_have_a_pattern_or_slope_refuse_it(settings: dict[str, Any], name: str):
-    with pytest.raises(BadInputError, match=next(iter(settings))):
+    with pytest.raises(calib.BadInputError, match=next(iter(settings))):
         calib.FitSettings(**settings | {name: "shared"})
-    with pytest.raises(BadInputError, match=name):
+    with pytest.raises(calib.BadInputError, match=name):
         calib.fit_from_ranges(flown(SHORT, 5)[0], **dict[str, Any]({name: "shared"}))
 
 
@@ -207,9 +206,9 @@ def test_ranges_are_corrected_by_two_directions_or_warn():
     low, high = known.quantiles(bare, (0.025, 0.975)).T
     assert 0.92 < np.mean((error > low) & (error < high)) < 0.98
     some = np.where(np.arange(500)[:, None, None] < 300, bare.toward, there.toward)
-    with pytest.warns(DirectionWarning, match="^memory: 60 % of the ranges have no known direction"):
+    with pytest.warns(calib.errors.DirectionWarning, match="^memory: 60 % of the ranges have no known direction"):
         calib.evaluate(replace(there, toward=some), known)
-    with pytest.raises(BadInputError, match="azimuth_deg"):
+    with pytest.raises(calib.BadInputError, match="azimuth_deg"):
         known.correct(3.0, -85.0, -86.0, 1, 2, azimuth_deg=(1.0, 2.0, 3.0))
 
 
@@ -219,10 +218,10 @@ def test_files_keep_patterns_and_older_programs_refuse_them():
     assert (calib.Calibration.from_json(text), json.loads(text)["schema_version"]) == (known, 6)
     table = json.loads(text)
     table["patterns"][0]["centre"].pop()
-    with pytest.raises(BadInputError, match=r"here: patterns.*8"):
+    with pytest.raises(calib.BadInputError, match=r"here: patterns.*8"):
         calib.Calibration.from_json(json.dumps(table), "here")
     for form in ("miluv", "ros-yaml"):
-        with pytest.raises(BadInputError, match="patterns over direction"):
+        with pytest.raises(calib.BadInputError, match="patterns over direction"):
             calib.export(known, form)
     assert "over direction" in repr(known)
 
@@ -284,7 +283,7 @@ def test_a_tag_that_is_added_has_the_pattern_that_others_share_or_one_that_is_un
     error = added.apply(of_five).corrected_m - of_five.truth_m
     assert np.std(error) < (0.065 if own else 0.045)
     assert np.std(error / added.apply(of_five).sigma_total_m) == pytest.approx(1.0, abs=0.1)
-    with pytest.raises(UnanswerableError, match="but only 0 exchanges have known directions"):
+    with pytest.raises(calib.UnanswerableError, match="but only 0 exchanges have known directions"):
         calib.add_tag(replace(there, toward=np.full_like(there.toward, np.nan)), known, 5)
 
 

@@ -16,7 +16,6 @@ from benchmarks.directions import Recipe, flight
 from calib.calibration import held_out_line
 from calib.calibration.patterns import TemperatureSlope
 from calib.data.ranges import read_c
-from calib.errors import BadInputError, TemperatureWarning, UnanswerableError
 from tests.calib import overhearing
 from tests.calib.c_header import printed
 from tests.processes import refuse, run
@@ -78,7 +77,9 @@ def test_a_warmer_flight_is_corrected_by_its_readings(tmp_path):
         done = run("calib", "fit", first, "-o", tmp_path / f"{name}.json", "--between", 0, *more)
         assert ("mm/K over temperature" in done.stdout) == (name == "auto")
     without, known = (calib.load_calibration(tmp_path / f"{name}.json") for name in ("none", "auto"))
-    with pytest.warns(TemperatureWarning, match=r"^tags 1, 2, 3, 4 were used more than 5 K outside the 20 to 3\d °C"):
+    with pytest.warns(
+        calib.errors.TemperatureWarning, match=r"^tags 1, 2, 3, 4 were used more than 5 K outside the 20 to 3\d °C"
+    ):
         judged = calib.evaluate(second, known).overall
     assert 0.92 < judged.inside_95 < 0.98
     # At 18 K above the fitted mean, ranges are 18 cm too long; the standard error of the slope leaves 0.5 cm.
@@ -121,19 +122,19 @@ def test_files_keep_slopes_and_older_programs_refuse_them():
     known = fitted(WARM, 3)
     text = known.to_json()
     assert (calib.Calibration.from_json(text), json.loads(text)["schema_version"]) == (known, 7)
-    with pytest.raises(BadInputError, match=r"here: temperatures.*span_c"):
+    with pytest.raises(calib.BadInputError, match=r"here: temperatures.*span_c"):
         calib.Calibration.from_json(text.replace('"span_c": [', '"span_c": [-500, '), "here")
     table = json.loads(text)
     table["temperatures"][0]["span_c"].reverse()
-    with pytest.raises(BadInputError, match="span_c: expected the lowest before the highest"):
+    with pytest.raises(calib.BadInputError, match="span_c: expected the lowest before the highest"):
         calib.Calibration.from_json(json.dumps(table), "here")
     for celsius, said in (
         (25.0, "1, expected those of initiator"),
         ((300.0, 25.0), "300, expected degrees"),
     ):
-        with pytest.raises(BadInputError, match=f"`temperature_c`: found {said}"):
+        with pytest.raises(calib.BadInputError, match=f"`temperature_c`: found {said}"):
             known.correct(3.0, -85.0, -86.0, 1, 2, temperature_c=celsius)
-    with pytest.raises(BadInputError, match="slopes over temperature"):
+    with pytest.raises(calib.BadInputError, match="slopes over temperature"):
         calib.export(known, "ros-yaml")
 
 
@@ -144,9 +145,11 @@ def test_delays_are_compared_at_one_temperature_or_not_at_all(tmp_path):
     # As stated, delays differ by 12 K of 5 mm/K, 0.4 ns; the curves do not.
     blind = [replace(one, temperatures=()) for one in (known, hotter)]
     assert abs(calib.compare(*blind).offset_m) > abs(calib.compare(known, hotter).offset_m) + 0.1
-    with pytest.raises(UnanswerableError, match=r"tags 1, 2.* slope over temperature in only one of the calibrations"):
+    with pytest.raises(
+        calib.UnanswerableError, match=r"tags 1, 2.* slope over temperature in only one of the calibrations"
+    ):
         calib.compare(known, blind[1])
-    with pytest.raises(BadInputError, match=r"`delays_from`.*reference temperature"):
+    with pytest.raises(calib.BadInputError, match=r"`delays_from`.*reference temperature"):
         calib.fit(flown(WARM, 3, 1)[0], delays_from=known)
 
 
@@ -155,7 +158,7 @@ def test_an_added_tag_shares_the_slope_of_the_others():
     others = {tag: delay for tag, delay in whole.delays_ns.items() if tag != 1}
     (slope,) = whole.temperatures
     known = replace(whole, delays_ns=others, temperatures=(replace(slope, tags=(2, 3, 4)),))
-    with pytest.warns(TemperatureWarning):
+    with pytest.warns(calib.errors.TemperatureWarning):
         added = calib.add_tag(hot, known, 1).calibration
     assert added.temperatures == (replace(slope, tags=(2, 3, 4, 1)),)
     # At 35 to 50 degrees, 15 K above the reference: without the slope, the delay would be 0.5 ns shorter.
@@ -173,7 +176,7 @@ def test_faulty_provenance_is_refused_in_a_line(tmp_path, broken, why):
     table = json.loads(fitted(WARM, 3).to_json())
     (tmp_path / "c.json").write_text(json.dumps(table | {"provenance": table["provenance"] | broken}))
     refuse("calib", "show", tmp_path / "c.json", naming=[why])
-    with pytest.raises(BadInputError, match="provenance: held_out"):
+    with pytest.raises(calib.BadInputError, match="provenance: held_out"):
         held_out_line(replace(fitted(WARM, 3), provenance={"held_out": broken}))
 
 
@@ -292,7 +295,7 @@ def test_readings_of_no_range_and_degrees_fahrenheit_have_a_warning(tag, later_s
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         calib.load_ranges(replace(flight, temperature=readings))
-    assert [one.category for one in caught] == [TemperatureWarning] * len(said)
+    assert [one.category for one in caught] == [calib.errors.TemperatureWarning] * len(said)
     assert all(re.search(pattern, str(one.message)) for pattern, one in zip(said, caught, strict=True))
 
 
@@ -312,7 +315,7 @@ def test_exact_ranges_of_a_data_frame_with_hot_boards_fit_and_warn_at_the_line_o
             "temp": rng.uniform(60, 70, 300),
         }
     )
-    with pytest.warns(TemperatureWarning, match="Fahrenheit") as caught:
+    with pytest.warns(calib.errors.TemperatureWarning, match="Fahrenheit") as caught:
         found = calib.fit(hot).calibration
     assert {one.filename for one in caught} == {__file__}
     assert list(found.delays_ns.values()) == pytest.approx([-0.1 / 0.299702547] * 3, abs=1e-6)

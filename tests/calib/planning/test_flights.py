@@ -9,7 +9,6 @@ import pytest
 
 import calib
 from calib.planning import FlightPlanSettings, flights
-from calib.planning.flights import ExpectedErrors, Information, flight_of
 from calib.planning.reference_motion import reference_motion
 from tests import processes
 from tests.calib.trajectories.sines import flight
@@ -25,8 +24,10 @@ def rehearsed(**other):
 
 
 def planned(seen, *, noise_m=0.04, reflected=0.08, curve=True, force=None, **usable):
-    errors = ExpectedErrors(noise_m=noise_m, reflected=reflected)
-    return Information(flight_of(seen, calib.FlightSettings(**usable), errors, curve=curve, force_std_m_s2=force))
+    errors = flights.ExpectedErrors(noise_m=noise_m, reflected=reflected)
+    return flights.Information(
+        flights.flight_of(seen, calib.FlightSettings(**usable), errors, curve=curve, force_std_m_s2=force)
+    )
 
 
 def mean_ns(seen, **given):
@@ -35,23 +36,23 @@ def mean_ns(seen, **given):
 
 
 def test_noise_alone_informs_by_its_inverse_variance_and_reflected_ranges_by_less():
-    plain = ExpectedErrors(noise_m=0.05, reflected=0.0).informed()
+    plain = flights.ExpectedErrors(noise_m=0.05, reflected=0.0).informed()
     assert plain == pytest.approx(0.05**-2, rel=1e-3)
     # A reflected range has nearly no information; a few that look direct reduce the information of the direct ones.
-    assert 0.6 * 0.7 * plain < ExpectedErrors(noise_m=0.05, reflected=0.3).informed() < 0.7 * plain
+    assert 0.6 * 0.7 * plain < flights.ExpectedErrors(noise_m=0.05, reflected=0.3).informed() < 0.7 * plain
 
 
 def test_with_everything_known_a_plan_is_a_fit_with_known_distances():
     """If all positions are known exactly, the covariance is that of least squares on delays alone."""
     given: Any = {"curve": False, "force_std_m_s2": None}
-    seen = flight_of(
+    seen = flights.flight_of(
         flight(seconds=8.0),
         calib.FlightSettings(heading_std_deg=0.0),
-        ExpectedErrors(noise_m=0.04, reflected=0.0),
+        flights.ExpectedErrors(noise_m=0.04, reflected=0.0),
         **given,
     )
     object.__setattr__(seen.scene.places, "std_m", np.full(len(seen.scene.places.std_m), 1e-5))
-    found = Information(seen)
+    found = flights.Information(seen)
     both = np.column_stack([seen.scene.ranges.initiator, seen.scene.ranges.target])
     rows = 0.5 * C_M_PER_NS * (both[:, :, None] == np.array(found.tags)).sum(axis=1)
     assert found.covariance_ns2 == pytest.approx(np.linalg.inv(rows.T @ rows / 0.04**2), rel=0.02, abs=1e-7)
@@ -166,7 +167,7 @@ def test_a_distance_of_robots_at_rest_determines_the_common_delay():
 def test_the_best_measured_distance_is_the_best_of_all():
     seen = planned(rehearsed(), poses_until_s=4.0, anchors="sought")
     pairs = [(a, b) for a in ANCHORS for b in ANCHORS if a < b]
-    spread = [np.trace(Information(seen.flight.taped([pair], 0.0, 0.01)).covariance_ns2) for pair in pairs]
+    spread = [np.trace(flights.Information(seen.flight.taped([pair], 0.0, 0.01)).covariance_ns2) for pair in pairs]
     assert seen.best_tape(0.0, 0.01) == pairs[int(np.argmin(spread))]
 
 

@@ -20,7 +20,6 @@ from tests.processes import refuse, succeed
 from uwblink import Contents, Recording, UwblinkError
 from uwblink.pages import figures
 from uwblink.pages.blocks import Document, write_document
-from uwblink.pages.figures import picture, sheet
 from uwblink.pages.pdf import to_pdf
 
 FORMS = {f"{width}.{kind}" for width in ("column", "page") for kind in ("pdf", "svg")}
@@ -234,7 +233,7 @@ def test_reports_do_not_replace_files(folder, tmp_path):
         assert not (folder / more[1]).exists()
     with pytest.raises(calib.BadInputError, match=r"a\.pdf"):
         check_places(tmp_path / "a.pdf", tmp_path / "a.pdf", None, force=True)
-    pictures = [Picture("same", lambda width: sheet(width)[0], text) for text in ("one", "two")]
+    pictures = [Picture("same", lambda width: figures.sheet(width)[0], text) for text in ("one", "two")]
     write_document(Document("", [*pictures]), None, figures=tmp_path / "f")
     names = {path.name for path in (tmp_path / "f").iterdir()}
     assert names == {f"{name}-{form}" for name in ("same", "same-2") for form in FORMS}
@@ -261,7 +260,7 @@ def test_plans_have_a_figure_of_each_arrangement(tmp_path):
     refuse(*words, cwd=tmp_path, naming=["plan.html"])
     assert (tmp_path / "plan.html").read_text() == page
     in_space = words_of(
-        picture(partial(arrangement, plan=calib.plan(5, on="space", arrangements=1), number=0), "svg").decode()
+        figures.picture(partial(arrangement, plan=calib.plan(5, on="space", arrangements=1), number=0), "svg").decode()
     )
     assert "height (m)" in in_space
     assert in_space.count("5") >= 3

@@ -21,7 +21,6 @@ from calib.cli.commands import app
 from calib.data.samples import ANCHOR_DELAYS_NS, stamped
 from calib.surveys.knowledge import load_knowledge
 from tests import processes
-from uwblink import SPEED_OF_LIGHT, Arrangement, Contents
 from uwblink.recording.schema import KnownDistance, load_places
 
 
@@ -64,8 +63,8 @@ def saved(world, path, known="line", distances=(), power_dbm=None):
     r, power = world.ranges, world.ranges.fpp1_dbm if power_dbm is None else np.full(len(world.ranges), power_dbm)
     x = stamped(r.time_ns, np.column_stack([r.initiator, r.target]), r.raw_m, np.stack([power, power]))
     at_ns = np.arange(len(world.places)) * 70 * 10**9
-    marks = [Arrangement("ABCDEFGH"[k], ns, ns + 65 * 10**9, known) for k, ns in enumerate(at_ns.tolist())]
-    Contents(exchanges=x, arrangements=marks, known_distances=list(distances)).save(path)
+    marks = [uwblink.Arrangement("ABCDEFGH"[k], ns, ns + 65 * 10**9, known) for k, ns in enumerate(at_ns.tolist())]
+    uwblink.Contents(exchanges=x, arrangements=marks, known_distances=list(distances)).save(path)
     return path
 
 
@@ -79,7 +78,7 @@ def test_without_noise_delays_and_places_are_exact():
     world = standing_boards(1, places=FOUR[:4], pair_error_m=0.0, noise_m=0.0)
     r, delay = world.ranges, np.array([0.0, *world.delays_ns.values()])
     low, high, count = np.minimum(r.initiator, r.target), np.maximum(r.initiator, r.target), np.ones(len(r))
-    raw = r.raw_m - SPEED_OF_LIGHT * 0.2e-9 * (delay[low] - delay[high])
+    raw = r.raw_m - uwblink.SPEED_OF_LIGHT * 0.2e-9 * (delay[low] - delay[high])
     weights: Any = {"weight_initiator": 0.7 * count, "weight_target": 0.3 * count}
     result = calib.survey(replace(r, initiator=low, target=high, raw_m=raw, **weights), known="line")
     # A tenth of a millimetre, 3e-4 ns: also in ranges without noise, one may be reflected by less than its noise.
@@ -181,7 +180,7 @@ def test_the_general_shape_applies_to_arrangements_without_one(tmp_path):
     path = tmp_path / "known.toml"
     path.write_text("known = 'line'\n" + marks + "[[arrangements]]\nname = 'p'\nknown = 'plane'\n")
     known = load_knowledge(path)
-    assert [known.shape_of(Arrangement(name, 0, 1)) for name in ("m0", "p")] == ["line", "plane"]
+    assert [known.shape_of(uwblink.Arrangement(name, 0, 1)) for name in ("m0", "p")] == ["line", "plane"]
     path.write_text("known = 'line'\n" + marks)
     result = calib.survey(world.ranges, known=path)
     assert {one.known for one in result.arrangements} == {"line"}
@@ -200,18 +199,18 @@ def test_files_of_known_facts_are_read(tmp_path):
     path = tmp_path / "known.toml"
     path.write_text(
         "[[distances]]\nbetween = [4, 1]\ndistance_m = 3.06\n"
-        "[[distances]]\nbetween = [1, 2]\ndistance_m = 2\nsigma_m = 0.02\narrangement = 'B'\n"
-        "[[positions]]\ntag = 4\nposition_m = [0.5, 5.2, 2.4]\n"
+        "[[distances]]\nbetween = [65535, 300]\ndistance_m = 2\nsigma_m = 0.02\narrangement = 'B'\n"
+        "[[positions]]\ntag = 65535\nposition_m = [0.5, 5.2, 2.4]\n"
         "[[positions]]\ntag = 0\nposition_m = [1, 2, 3]\nsigma_m = 0.03\narrangement = 'A'\n"
         "[[arrangements]]\nname = 'B'\norder = [3, 1, 4, 2]\nstart_s = 70\nend_s = 130.5\n"
     )
     known = load_knowledge(path)
-    assert known.distances == (KnownDistance(1, 4, 3.06, 0.005, ""), KnownDistance(1, 2, 2.0, 0.02, "B"))
+    assert known.distances == (KnownDistance(1, 4, 3.06, 0.005, ""), KnownDistance(300, 65535, 2.0, 0.02, "B"))
     assert known.positions == (
-        calib.KnownPosition(4, (0.5, 5.2, 2.4), 0.01, ""),
+        calib.KnownPosition(65535, (0.5, 5.2, 2.4), 0.01, ""),
         calib.KnownPosition(0, (1.0, 2.0, 3.0), 0.03, "A"),
     )
-    assert (known.spans_s, known.order_of(Arrangement("B", 0, 1))) == ({"B": (70.0, 130.5)}, (3, 1, 4, 2))
+    assert (known.spans_s, known.order_of(uwblink.Arrangement("B", 0, 1))) == ({"B": (70.0, 130.5)}, (3, 1, 4, 2))
 
 
 def test_a_distance_for_all_arrangements_is_one_measurement():
@@ -406,8 +405,8 @@ def recording(tmp_path_factory):
     for k in range(4):
         r = ranges[ranges.time_ns // 40_000_000_000 == k]
         x = stamped(r.time_ns, np.column_stack([r.initiator, r.target]), r.raw_m, np.full((2, len(r)), np.nan))
-        marks = [Arrangement("ABCD"[k], int(r.time_ns[0]), int(r.time_ns[-1]) + 1, "line")]
-        Contents(exchanges=x, arrangements=marks).save(folder / f"{k}.uwb")
+        marks = [uwblink.Arrangement("ABCD"[k], int(r.time_ns[0]), int(r.time_ns[-1]) + 1, "line")]
+        uwblink.Contents(exchanges=x, arrangements=marks).save(folder / f"{k}.uwb")
     return [str(folder / f"{k}.uwb") for k in range(4)]
 
 
@@ -472,7 +471,7 @@ def test_two_arrangements_of_one_name_are_refused_by_flags_that_the_command_has(
 
 def test_a_recording_that_is_given_twice_is_refused_under_any_name(recording, tmp_path):
     with uwblink.Recording.open(recording[0]) as one:
-        unmarked = Contents(exchanges=one.exchanges())
+        unmarked = uwblink.Contents(exchanges=one.exchanges())
     paths = [tmp_path / name for name in ("one.uwb", "other.uwb")]
     for path in paths:
         unmarked.save(path)

@@ -17,7 +17,6 @@ from tests.registered import registered
 from uwblink.boards import DIALECTS, Dialect, LivePage, PrintedRange, dialect_of, load_correction
 from uwblink.boards.dialects import Printed
 from uwblink.boards.ports import Terminal
-from uwblink.errors import ArgumentError, ImportTableError, PlanError
 from uwblink.importers import read_source
 from uwblink.importers.devices import LINES
 
@@ -133,8 +132,8 @@ def test_maps_have_the_same_effect_for_boards_and_logs(tmp_path):
     assert (one.from_id, one.to_id, one.range_m) == (None, 65535, 1.25)
     assert one.power_dbm == pytest.approx(power_dbm)
     for text, error, said in (
-        ('line = "{from_id} {range_m}"\n', ImportTableError, "to_id"),
-        ('[columns]\nrange_m = "d"\n', ArgumentError, "line"),
+        ('line = "{from_id} {range_m}"\n', uwblink.errors.ImportTableError, "to_id"),
+        ('[columns]\nrange_m = "d"\n', uwblink.errors.ArgumentError, "line"),
     ):
         (tmp_path / "wrong.toml").write_text(text)
         with pytest.raises(error, match=said):
@@ -193,7 +192,7 @@ def test_dialects_come_by_entry_points_and_words_get_ids():
     assert sorted(seen.numbers.values()) == [1, 2, 3]
     named = {number: name for name, number in seen.numbers.items()}
     assert {(named[turn.pair[1]], turn.report.range_m) for turn in found} == {("alpha", 1.0), ("beta", 2.0)}
-    with pytest.raises(ArgumentError, match="parse"):
+    with pytest.raises(uwblink.errors.ArgumentError, match="parse"):
         DIALECTS.register(Dialect("bad", "No function.", None))  # type: ignore[arg-type]
 
 
@@ -224,7 +223,7 @@ def test_the_page_shows_printed_ranges_and_their_corrections(tmp_path):
     assert "%" not in body
     with printing(other) as port, LivePage(tmp_path / "s.uwb", correct=correct) as page:
         how = {"ids": [40], "duration_s": 30, "watch": page.watch, "listeners": [page]}
-        with pytest.raises(PlanError, match="6019"):
+        with pytest.raises(uwblink.errors.PlanError, match="6019"):
             uwblink.boards.record_printed([port], tmp_path / "s.uwb", dialect_of("arduino"), **how)
 
 

@@ -12,16 +12,12 @@ import uwblink
 from benchmarks.hours import RATE_HZ, AnsweringPorts
 from tests.boards import bench_scenario, record_bench
 from tests.processes import wait_until
-from uwblink import Listener, RangingPlan
 from uwblink.boards import record as writing
-from uwblink.boards.record import RecordingWriter, append_rows, identify
 from uwblink.boards.recorder import Recorder
-from uwblink.errors import RecordingError
-from uwblink.recording.file import Recording
 from uwblink.recording.schema import FrameRow
 from uwblink.recording.store import Store
-from uwblink.wire.messages import RangeReport
-from uwbsim.boards.virtual_board import VirtualPorts
+from uwblink.wire import RangeReport
+from uwbsim import VirtualPorts
 
 
 def recorded(path, *listeners, ports=None, seconds=2.0):
@@ -98,7 +94,7 @@ def test_one_damaged_line_is_one_fault(tmp_path):
 
 @pytest.fixture
 def live(tmp_path):
-    with Recording.create(tmp_path / "live.uwb", live=True) as recording:
+    with uwblink.Recording.create(tmp_path / "live.uwb", live=True) as recording:
         yield recording
 
 
@@ -118,9 +114,9 @@ def test_rows_are_committed_while_a_long_log_is_put_into_the_file(live, monkeypa
         begun.set()
         over.wait(60)
 
-    monkeypatch.setattr(Recording, "shorten_log", shorten_log)
+    monkeypatch.setattr(uwblink.Recording, "shorten_log", shorten_log)
     log, written = Path(f"{live.path}.wal"), []
-    with RecordingWriter(live) as writer:
+    with writing.RecordingWriter(live) as writer:
         writer.on_bytes(1, "port", "in", bytes(30_000))
         assert begun.wait(60)
         for k in range(3):
@@ -135,28 +131,30 @@ def test_rows_are_committed_while_a_long_log_is_put_into_the_file(live, monkeypa
 def test_a_log_stays_short_and_everything_is_in_the_file(live, monkeypatch):
     monkeypatch.setattr(writing, "LONG_LOG", 20_000)
     log, before = Path(f"{live.path}.wal"), live.path.stat().st_size
-    with RecordingWriter(live) as writer:
+    with writing.RecordingWriter(live) as writer:
         writer.on_bytes(1, "port", "in", bytes(range(256)) * 100)
         wait_until(lambda: size(live.path) > before and size(log) < 20_000)
         writer.on_bytes(2, "port", "in", b"later")
     assert [frame.data for frame in live.frames()] == [bytes(range(256)) * 100, b"later"]
 
 
-@pytest.mark.parametrize("error", [MemoryError("no more"), RuntimeError("a bug"), RecordingError("disk full")])
+@pytest.mark.parametrize(
+    "error", [MemoryError("no more"), RuntimeError("a bug"), uwblink.errors.RecordingError("disk full")]
+)
 def test_failures_of_writing_are_reported_within_a_second(live, monkeypatch, error):
-    writer = RecordingWriter(live)
+    writer = writing.RecordingWriter(live)
 
     def failing(_recording, _table, _rows):
         raise error
 
-    monkeypatch.setattr(Recording, "append", failing)
+    monkeypatch.setattr(uwblink.Recording, "append", failing)
     writer.on_bytes(5, "port", "in", b"x")
     begun = time.monotonic()
-    with pytest.raises(RecordingError, match=str(error)):
+    with pytest.raises(uwblink.errors.RecordingError, match=str(error)):
         while time.monotonic() < begun + 10.0:  # ten, because of other load; it takes one period of the writer
             writer.check()
             time.sleep(0.01)
-    with pytest.raises(RecordingError, match=str(error)):
+    with pytest.raises(uwblink.errors.RecordingError, match=str(error)):
         writer.close()
 
 
@@ -167,7 +165,7 @@ WARM, LATER, LONG = 1_100, 2_300, 2_400
 EVERY = 100
 
 
-class Committing(Listener):
+class Committing(uwblink.Listener):
     """Commits after every few exchanges, in the loop itself, and stores the statements of each commit."""
 
     def __init__(self, recording, every=EVERY):
@@ -189,7 +187,7 @@ class Committing(Listener):
         before = len(STATEMENTS)
         self.rows.append(len(self.batch))
         with self.recording.transaction():
-            append_rows(self.recording, self.batch)
+            writing.append_rows(self.recording, self.batch)
         self.asked.append(STATEMENTS[before:])
         self.batch = []
 
@@ -213,10 +211,10 @@ def statements(monkeypatch):
 @pytest.mark.slow
 def test_nothing_grows_with_the_recording(tmp_path, statements):
     ports, held = AnsweringPorts(), {}
-    with Recording.create(tmp_path / "long.uwb", live=True) as recording:
+    with uwblink.Recording.create(tmp_path / "long.uwb", live=True) as recording:
         committing = Committing(recording)
-        found = identify(ports.names, ports)
-        plan = RangingPlan(ports.pairs[:1], rate_hz=RATE_HZ)
+        found = writing.identify(ports.names, ports)
+        plan = uwblink.RangingPlan(ports.pairs[:1], rate_hz=RATE_HZ)
         recorder = Recorder(found, plan, plan.turns(sorted(found)), [committing], ports=ports)
         for _ in recorder.steps(stop=lambda: committing.exchanges >= LONG):
             if committing.exchanges in (WARM, LATER) and committing.exchanges not in held:

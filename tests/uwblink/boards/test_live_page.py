@@ -19,13 +19,11 @@ import uwblink
 from tests.boards import bench_scenario, record_bench, served
 from tests.browser import chromium
 from tests.processes import BIN, wait_until
-from uwblink.boards import live_page
-from uwblink.boards.listeners import PairState, Progress, Turn, load_correction
-from uwblink.boards.live_page import LivePage
-from uwblink.errors import PlanError, PortError
+from uwblink.boards import LivePage, Progress, live_page, load_correction
+from uwblink.boards.listeners import PairState, Turn
 from uwblink.recording.schema import Fault
-from uwblink.wire.messages import RangeReport
-from uwbsim.boards.virtual_board import VirtualPorts
+from uwblink.wire import RangeReport
+from uwbsim import VirtualPorts
 
 
 def fetch(page, path="", method="GET", **headers):
@@ -166,7 +164,7 @@ def test_the_page_is_served_to_this_computer_only(tmp_path):
                 fetch(page, path, method, Host=host)
             refused.value.close()
             assert refused.value.code == status
-        with pytest.raises(PortError, match="cannot be served there"):
+        with pytest.raises(uwblink.errors.PortError, match="cannot be served there"):
             LivePage(tmp_path / "f.uwb", port=port_of(page))
 
 
@@ -241,7 +239,7 @@ def test_a_calibration_s_correction_is_found_by_its_entry_point(tmp_path):
     flight = calib.sample_flight()
     calibration = calib.fit(flight).calibration
     (tmp_path / "c.json").write_text("{}")
-    with pytest.raises(PlanError, match=r"c\.json"):
+    with pytest.raises(uwblink.errors.PlanError, match=r"c\.json"):
         load_correction(tmp_path / "c.json")
     calibration.save(tmp_path / "d.json")
     correct = load_correction(tmp_path / "d.json")

@@ -19,13 +19,10 @@ import uwblink
 from benchmarks.hours import AnsweringPort, AnsweringPorts
 from tests import processes
 from tests.boards import bench_scenario, record_bench, served
-from tests.processes import fork
-from uwblink import Listener, RangingPlan, Recording
 from uwblink.boards.listeners import Progress
 from uwblink.boards.ports import SerialPorts, Terminal
 from uwblink.boards.record import LONGEST_BACKLOG_S, RecordingWriter, record
 from uwblink.boards.recorder import Recorder
-from uwblink.errors import RecordingError
 from uwblink.wire import messages as m
 from uwblink.wire.codec import encode
 from uwbsim.boards.virtual_board import VirtualPorts
@@ -33,7 +30,7 @@ from uwbsim.boards.virtual_board import VirtualPorts
 HOUR_NS = 3600 * 10**9
 
 
-class After(Listener):
+class After(uwblink.Listener):
     """Runs functions after some numbers of turns of the plan."""
 
     def __init__(self, **what):
@@ -57,7 +54,7 @@ def test_setting_the_host_clock_changes_no_times(tmp_path, monkeypatch):
     before = plain()
     with served() as server:
         ports = list(server.names.values())
-        record(ports, path, RangingPlan(), duration_s=60.0, listeners=[clock], stop=lambda: clock.turns > 60)
+        record(ports, path, uwblink.RangingPlan(), duration_s=60.0, listeners=[clock], stop=lambda: clock.turns > 60)
     time_ns = uwblink.load(path).exchanges.time_ns
     assert len(time_ns) > 50
     # The duration of the test, and not an hour.
@@ -102,7 +99,7 @@ def test_suspension_is_only_a_gap(tmp_path):
 
 @pytest.fixture
 def live(tmp_path):
-    with Recording.create(tmp_path / "live.uwb", live=True) as recording:
+    with uwblink.Recording.create(tmp_path / "live.uwb", live=True) as recording:
         yield recording
 
 
@@ -122,7 +119,7 @@ def test_a_slow_disk_is_reported(live, monkeypatch):
     with RecordingWriter(live) as writer:
         monkeypatch.setattr(time, "monotonic", lambda: plain() + later[0])
         monkeypatch.setattr(writer, "_write", lambda: None)
-        with pytest.raises(RecordingError, match=r"the disk is 2\d s late"):
+        with pytest.raises(uwblink.errors.RecordingError, match=r"the disk is 2\d s late"):
             for _ in range(60):  # the loop asks during all this time
                 later[0] += 0.5
                 writer.check()
@@ -141,8 +138,11 @@ def test_a_removed_file_is_reported_within_a_second(tmp_path, replaced):
             path.write_text("mine")
         begun.append(time.monotonic())
 
-    with served() as server, pytest.raises(RecordingError, match=r"f\.uwb: was removed or replaced during"):
-        record(server.names.values(), path, RangingPlan(), duration_s=60.0, listeners=[After(t20=remove)])
+    with (
+        served() as server,
+        pytest.raises(uwblink.errors.RecordingError, match=r"f\.uwb: was removed or replaced during"),
+    ):
+        record(server.names.values(), path, uwblink.RangingPlan(), duration_s=60.0, listeners=[After(t20=remove)])
     assert time.monotonic() < begun[0] + 20.0  # a second on an idle machine
     assert not replaced or path.read_text() == "mine"
 
@@ -167,8 +167,10 @@ def test_a_read_only_folder_loses_no_data():
         after = After(t20=lock)
         os.seteuid(NOBODY)
         try:
-            with pytest.raises(RecordingError, match=r"any more \(.*Permission denied\).* everything before is kept"):
-                record_bench(path, RangingPlan(), duration_s=1.0, listeners=[after])
+            with pytest.raises(
+                uwblink.errors.RecordingError, match=r"any more \(.*Permission denied\).* everything before is kept"
+            ):
+                record_bench(path, uwblink.RangingPlan(), duration_s=1.0, listeners=[after])
             exchanges, kinds = exchanges_of(path)
         finally:
             os.seteuid(0)
@@ -185,10 +187,10 @@ def test_two_recorders_cannot_have_one_file(tmp_path):
     def second():
         with served() as other:
             words = ["uwblink", "record", *other.names.values(), "-o", path, "--pairs", "all", "--force"]
-            found.append(fork(*words, "--duration", "1"))
-        found.append(fork("uwblink", "import", "csv", "docs/examples/exchanges.csv", "-o", path, "--force"))
+            found.append(processes.fork(*words, "--duration", "1"))
+        found.append(processes.fork("uwblink", "import", "csv", "docs/examples/exchanges.csv", "-o", path, "--force"))
 
-    record_bench(path, RangingPlan(), duration_s=2.0, listeners=[After(t20=second)])
+    record_bench(path, uwblink.RangingPlan(), duration_s=2.0, listeners=[After(t20=second)])
     told = f"error: {path}: another process is writing it; give another name\n"
     assert [(ended.returncode, ended.stderr) for ended in found] == [(2, told)] * 2
     exchanges, kinds = exchanges_of(path)

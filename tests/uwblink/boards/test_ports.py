@@ -145,13 +145,6 @@ def test_wrong_plan_files_are_refused(tmp_path, text, fragment):
         load_plan(written(tmp_path, text))
 
 
-def test_an_absent_tag_is_named():
-    with pytest.raises(PlanError, match="contains 9, but the boards at the ports are 1, 2"):
-        RangingPlan(((1, 9),)).turns([1, 2])
-    with pytest.raises(PlanError, match="two boards that range"):
-        RangingPlan().turns([1])
-
-
 def test_tags_come_from_a_scenario_too(tmp_path):
     assert load_places(written(tmp_path, "[run]\nseed = 1\n[[tags]]\nid = 4\nbody = 'x'\nskew_ppm = 3\n"))[0] == (
         Tag(4, "x", (0.0, 0.0, 0.0)),

@@ -17,8 +17,6 @@ from tests.processes import wait_until
 from tests.shared_data import ROOT
 from uwblink.cli import shared
 from uwblink.cli.commands import app
-from uwblink.cli.shared import waiting
-from uwblink.errors import PluginWarning, RecordingError
 
 
 class MineError(Exception):
@@ -40,7 +38,11 @@ def run_as_command(work, *errors, **how):
     ("error", "code", "line"),
     [
         (None, 0, ""),
-        (RecordingError("f.uwb: exists; or `force` and `map_file`"), 2, "error: f.uwb: exists; or --force and --map\n"),
+        (
+            uwblink.errors.RecordingError("f.uwb: exists; or `force` and `map_file`"),
+            2,
+            "error: f.uwb: exists; or --force and --map\n",
+        ),
         (MineError("mine"), 2, "error: mine\n"),
         (WorseError("worse"), 1, "error: worse\n"),
         (MineError("a\nb\x1b[31m \ud800"), 2, "error: a\\nb\\x1b[31m \\ud800\n"),
@@ -81,7 +83,7 @@ def test_unexpected_errors_are_raised():
 def test_only_warnings_of_plug_ins_become_lines(capsys):
     def warn() -> None:
         warnings.simplefilter("always")
-        warnings.warn("left out", PluginWarning, stacklevel=1)
+        warnings.warn("left out", uwblink.errors.PluginWarning, stacklevel=1)
         warnings.warn("other", UserWarning, stacklevel=1)
 
     with pytest.warns(UserWarning, match="other") as caught, pytest.raises(SystemExit):
@@ -224,7 +226,7 @@ class Terminal(io.StringIO):
 def test_progress_on_a_terminal_is_shown_and_removed(monkeypatch):
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
-    with waiting("fitting [1]") as update:
+    with shared.waiting("fitting [1]") as update:
         update("drawing")
         update(0.25)
         wait_until(lambda: all(shown in screen.getvalue() for shown in ("fitting [1]", "drawing", "25%")))
@@ -232,6 +234,6 @@ def test_progress_on_a_terminal_is_shown_and_removed(monkeypatch):
 
 
 def test_progress_is_not_shown_elsewhere(capsys):
-    with waiting("fitting") as update:
+    with shared.waiting("fitting") as update:
         update(0.5)
     assert capsys.readouterr() == ("", "")

@@ -14,8 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 import calib
 from tests.registered import registered
 from tests.uwblink.recording.test_contents import full, rows  # noqa: F401 - full is a fixture
-from uwblink import Contents, Exchanges, Recording, import_recording, load
-from uwblink.errors import ArgumentError, ImportTableError, RecordingError, RecordingExistsError
+from uwblink import Contents, Exchanges, Recording, errors, import_recording, load
 from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
 from uwblink.importers import read_source
 from uwblink.importers.poses import read_poses
@@ -74,13 +73,13 @@ def test_an_earlier_export_is_replaced(whole, tmp_path):
 def test_a_folder_without_a_name_of_its_own_is_refused_with_an_example(whole, tmp_path, monkeypatch, out, force):
     (tmp_path / "inside").mkdir()
     monkeypatch.chdir(tmp_path / "inside")
-    with pytest.raises(RecordingExistsError, match=r"existing folder.*as in .*tables"):
+    with pytest.raises(errors.RecordingExistsError, match=r"existing folder.*as in .*tables"):
         export_recording(whole, out, to="csv", force=force)
     assert [*tmp_path.rglob("*")] == [tmp_path / "inside"]
 
 
 def test_folders_without_an_export_are_not_replaced(whole, tmp_path):
-    with pytest.raises(ImportTableError, match=r"contains no exchanges\.csv"):
+    with pytest.raises(errors.ImportTableError, match=r"contains no exchanges\.csv"):
         import_recording(tmp_path, tmp_path / "o.uwb", importer="exported")
     export_recording(whole, tmp_path / "out", to="csv")
     for name, old, new, said in (
@@ -89,7 +88,7 @@ def test_folders_without_an_export_are_not_replaced(whole, tmp_path):
     ):
         kept = (tmp_path / "out" / name).read_text()
         (tmp_path / "out" / name).write_text(kept.replace(old, new, 1))
-        with pytest.raises(ImportTableError, match=said):
+        with pytest.raises(errors.ImportTableError, match=said):
             import_recording(tmp_path / "out", tmp_path / "o.uwb", importer="exported")
         (tmp_path / "out" / name).write_text(kept)
     assert not (tmp_path / "o.uwb").exists()
@@ -102,7 +101,7 @@ def test_registered_exporters_are_used(whole, tmp_path):
 
     with registered(EXPORTERS, Exporter("names", write, "the name")):
         assert export_recording(whole, tmp_path / "out", to="names") == {"name.txt": 1}
-    with pytest.raises(ArgumentError, match="this name is reserved"):
+    with pytest.raises(errors.ArgumentError, match="this name is reserved"):
         register_exporter(Exporter("csv", write, "mine"))
 
 
@@ -266,14 +265,14 @@ def test_values_that_do_not_fit_messages_are_an_error_of_one_line(tmp_path, to, 
     sample = Exchanges.from_arrays([1], [2], time_ns=[time_ns], range_m=[range_m], tx1=[0], rx1=[5], tx2=[9], rx2=[30])
     poses = Poses(np.array([9]), np.array(["drone"]), np.array([[x, 1.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))
     Contents(exchanges=sample, poses=poses).save(tmp_path / "r.uwb")
-    with pytest.raises(RecordingError, match=said):
+    with pytest.raises(errors.RecordingError, match=said):
         export_recording(tmp_path / "r.uwb", tmp_path / "out", to=to)
     assert not (tmp_path / "out").exists()
 
 
 def test_bags_without_the_extra_are_refused(recording, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag2", None)
-    with pytest.raises(RecordingError, match=r"pip install 'uwbcal\[bags\]'"):
+    with pytest.raises(errors.RecordingError, match=r"pip install 'uwbcal\[bags\]'"):
         export_recording(recording, tmp_path / "out", to="rosbag2")
     assert not (tmp_path / "out").exists()
 

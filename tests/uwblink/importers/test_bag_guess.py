@@ -25,11 +25,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 EXCHANGE = "std_msgs/Header header\nuint16 a\nuint16 b\nuint64[6] stamps\nfloat32 power\nfloat64 odd\n"
 ONE_OF_LIST = "string anchor\nfloat64 distance\nfloat32 rssi\n"
-ARRAY = "std_msgs/Header header\nuint16 tag\nfloat32[8] dis_arr\n"
 LISTS = "std_msgs/Header header\nuwb_msgs/Range[] ranges\n"
 MINES = "std_msgs/Header header\nstring dest\nfloat32 range_mm\nfloat32 rssi\n"
 STAMPS = "std_msgs/Header header\nuint16 src\nuint16 dst\nuint64 tx1\nuint64 rx1\nuint64 tx2\nuint64 rx2\n"
-TYPES = {"Exchange": EXCHANGE, "Range": ONE_OF_LIST, "Ranges": LISTS, "Array": ARRAY, "Mine": MINES, "Stamped": STAMPS}
+TYPES = {"Exchange": EXCHANGE, "Range": ONE_OF_LIST, "Ranges": LISTS, "Mine": MINES, "Stamped": STAMPS}
 TICK_M = 299_702_547.0 / (128 * 499_200_000)
 WHEN = 1_706_822_508_042_560_815
 

@@ -13,11 +13,9 @@ from tests import processes
 from tests.errors import one_line
 from tests.shared_data import shared
 from tests.uwblink.test_receptions import PLACES, broadcasts
-from uwblink import raw_range
-from uwblink.errors import ImportTableError
+from uwblink import errors, load, raw_range
 from uwblink.importers import import_file, read_source
 from uwblink.importers.guess import guess_map
-from uwblink.recording.contents import load
 
 NAMES = [f"0x{tag:04X}" for tag in (0xE621, 0x9042, 0x853C, 0xBB1E)]
 
@@ -106,7 +104,7 @@ def test_restarted_frame_numbers_are_other_frames(tmp_path):
     ],
 )
 def test_maps_that_cannot_be_are_refused_with_the_key(tmp_path, change, said):
-    with pytest.raises(ImportTableError, match=one_line(said)):
+    with pytest.raises(errors.ImportTableError, match=one_line(said)):
         imported(tmp_path, printed(broadcasts(rounds=30)), change)
 
 

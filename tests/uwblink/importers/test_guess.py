@@ -19,11 +19,9 @@ from tests.uwblink.importers.test_table_forms import (
     wrapped,
     write,
 )
-from uwblink.errors import ImportTableError
-from uwblink.importers import import_recording
+from uwblink import errors, import_recording, load
 from uwblink.importers.column_map import load_map
 from uwblink.importers.guess import guess_map
-from uwblink.recording.contents import load
 from uwblink.ticks import TICKS_PER_SECOND
 
 POLL = ("poll_tx", "poll_rx", "resp_tx", "resp_rx", "final_tx", "final_rx")
@@ -37,38 +35,47 @@ def guessed(tmp_path, rows, *how):
     return read_table(path, mapped(tmp_path, guess.text))
 
 
+ENDS = ("timestamp", "Tag ID", "anchor_id")
+POWERS = ("fp_power_1", "fpp2")
+GERMAN = ("Zeit [s]", "Quelle", "Empfänger", *(f"T_{n} [ns]" for n in HEADER[3:9]), "FP1 [dBm]", "FP2 [dBm]")
+AT_DEVICES = ("Datum", "Sender", "Ziel", *POLL, "fp_power_resp (dBm)", "fp_power_init (dBm)")
+OF_MESSAGES = ("t_s", "src", "dst", *(f"ts_{n}" for n in POLL), "poll_fp_level", "resp_fp_level")
+NS, US = 1e9 / TICKS_PER_SECOND, 1e6 / TICKS_PER_SECOND
+
+
 @pytest.mark.parametrize(
-    ("names", "scale", "third"),
+    ("called", "unit", "third", "decimal"),
     [
-        (dict(zip(HEADER[3:9], (f"{name}_ticks" for name in POLL), strict=True)), 1.0, "target"),
-        (dict(zip(HEADER[3:9], (f"T{k}" for k in range(1, 7)), strict=True)), 1.0, "initiator"),
-        (dict(zip(HEADER[3:9], (f"{n}_raw" for n in HEADER[3:9]), strict=True)), 1e9 / TICKS_PER_SECOND, "target"),
+        ((*ENDS, *(f"{name}_ticks" for name in POLL), *POWERS), 1, "target", "."),
+        ((*ENDS, *(f"T{k}" for k in range(1, 7)), *POWERS), 1, "initiator", "."),
+        ((*ENDS, *(f"{n}_raw" for n in HEADER[3:9]), *POWERS), NS, "target", "."),
         *(
-            (
-                dict(zip(HEADER[3:9], (f"{n} [{us}]" for n in HEADER[3:9]), strict=True)),
-                1e6 / TICKS_PER_SECOND,
-                "target",
-            )
+            ((*ENDS, *(f"{n} [{us}]" for n in HEADER[3:9]), *POWERS), US, "target", ".")
             for us in ("us", "\u00b5s", "\u03bcs")
         ),
+        ((*GERMAN, "Referenz [cm]"), NS, "target", ","),
+        ((*AT_DEVICES, "Tape"), 1, "target", "."),
+        ((*OF_MESSAGES, "distance_gt_cm"), 1, "target", "."),
     ],
 )
-def test_guesses_read_tables_correctly(tmp_path, names, scale, third):
-    rows = flights(third=third)
-    names = names | {"time_s": "timestamp", "from_id": "Tag ID", "to_id": "anchor_id", "fpp1": "fp_power_1"}
-    table = [
-        {names.get(n, n): v * scale if n in HEADER[3:9] and scale != 1 else v for n, v in row.items()}
-        for row in wrapped(rows)
-    ]
-    found = guessed(tmp_path, table, ";")
+def test_guesses_read_tables_with_common_column_names_correctly(tmp_path, called, unit, third, decimal):
+    """The last column, if any, is the true distance."""
+    rows, names = flights(third=third), dict(zip((*HEADER, "truth"), called, strict=False))
+    scale = dict.fromkeys(HEADER[3:9], unit) | {"truth": 100.0 if "cm" in called[-1] else 1.0}
+    whole = [short | {"truth": row["truth"]} for short, row in zip(wrapped(rows), rows, strict=True)]
+    table = [{name: row[n] * scale.get(n, 1) for n, name in names.items()} for row in whole]
+    found = guessed(tmp_path, table, ";", lambda value: str(value).replace(".", decimal))
     same(found, rows)
-    assert found.exchanges.fpp1_dbm.tolist() == [row["fpp1"] for row in rows]
-    assert found.exchanges.time_ns.tolist() == [round(row["time_s"] * 1e9) for row in rows]
+    e = found.exchanges
+    assert [e.fpp1_dbm.tolist(), e.fpp2_dbm.tolist()] == [[row[name] for row in rows] for name in ("fpp1", "fpp2")]
+    assert e.time_ns.tolist() == [round(row["time_s"] * 1e9) for row in rows]
+    if "truth" in names:
+        assert e.truth_m == pytest.approx([row["truth"] for row in rows])
 
 
 def test_a_table_of_poses_is_sent_to_the_command_for_poses(tmp_path):
     (tmp_path / "p.csv").write_text("time_s,body,x,y,z,qx,qy,qz,qw\n0,a,1,2,3,0,0,0,1\n1,a,1,2,3,0,0,0,1\n")
-    with pytest.raises(ImportTableError, match="uwblink poses"):
+    with pytest.raises(errors.ImportTableError, match="uwblink poses"):
         guess_map(tmp_path / "p.csv")
 
 
@@ -158,29 +165,6 @@ def test_zero_third_intervals_give_no_numpy_warning(tmp_path):
     assert "tx3" in guess_map(write(tmp_path / "t.csv", rows, ",")).text
 
 
-GERMAN = ("Zeit [s]", "Quelle", "Empfänger", *(f"T_{n} [ns]" for n in HEADER[3:9]), "FP1 [dBm]", "FP2 [dBm]")
-AT_DEVICES = ("Datum", "Sender", "Ziel", *POLL, "fp_power_resp (dBm)", "fp_power_init (dBm)")
-OF_MESSAGES = ("t_s", "src", "dst", *(f"ts_{n}" for n in POLL), "poll_fp_level", "resp_fp_level")
-
-
-@pytest.mark.parametrize(
-    ("called", "true", "decimal"),
-    [(GERMAN, "Referenz [cm]", ","), (AT_DEVICES, "Tape", "."), (OF_MESSAGES, "distance_gt_cm", ".")],
-)
-def test_common_column_names_are_guessed(tmp_path, called, true, decimal):
-    rows = flights()
-    names = dict(zip(HEADER, called, strict=True)) | {"truth": true}
-    scale = dict.fromkeys(HEADER[3:9], 1e9 / TICKS_PER_SECOND) if "[ns]" in called[3] else {}
-    scale |= {"truth": 100.0} if "cm" in true else {}
-    whole = [short | {"truth": row["truth"]} for short, row in zip(wrapped(rows), rows, strict=True)]
-    table = [{names[n]: v * scale[n] if n in scale else v for n, v in row.items()} for row in whole]
-    found = guessed(tmp_path, table, ";", lambda value: str(value).replace(".", decimal))
-    same(found, rows)
-    e = found.exchanges
-    assert [e.fpp1_dbm.tolist(), e.fpp2_dbm.tolist()] == [[row[name] for row in rows] for name in ("fpp1", "fpp2")]
-    assert e.truth_m == pytest.approx([row["truth"] for row in rows])
-
-
 @pytest.mark.parametrize("third", [True, False])
 def test_messages_that_are_counted_from_zero(tmp_path, third):
     rows = flights()
@@ -245,12 +229,12 @@ def test_missing_information_is_asked_for(tmp_path, row, asked, answer):
     rows = [{n: v + k if n in ("t", "range", "t_s") else v for n, v in row.items()} for k in range(40)]
     text = guess_map(write(tmp_path / "t.csv", rows)).text
     assert f'{asked} = "?"' in text
-    with pytest.raises(ImportTableError, match=asked):
+    with pytest.raises(errors.ImportTableError, match=asked):
         read_rows(tmp_path, rows, text)
     if answer == '"?"':
         return
     if asked != "time":
-        with pytest.raises(ImportTableError, match=f"units.{asked}"):
+        with pytest.raises(errors.ImportTableError, match=f"units.{asked}"):
             read_rows(tmp_path, rows, text.replace(f'{asked} = "?"', "#"))
     found = read_rows(tmp_path, rows, text.replace(f'{asked} = "?"', f'{asked} = "{answer}"'))
     assert found.exchanges.time_ns[1] - found.exchanges.time_ns[0] == (10**6 if asked == "time" else 10**9)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tracemalloc
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from typing import ClassVar
 
@@ -26,7 +27,7 @@ from tests.uwblink.importers.test_table_forms import (
     wrapped,
     write,
 )
-from uwblink.errors import ImportTableError, RecordingError
+from uwblink import Contents, Exchanges, errors, import_recording, load, register_importer
 from uwblink.exporters import EXPORTERS, Exporter, export_recording
 from uwblink.importers import (
     IMPORTERS,
@@ -34,11 +35,9 @@ from uwblink.importers import (
     Importer,
     bags,
     import_file,
-    import_recording,
     read_source,
     staging,
 )
-from uwblink.recording.contents import load
 
 LINE = "0.5,1,2,3.25\n"
 HEAD = "time_s,from_id,to_id,range_m\n"
@@ -103,7 +102,7 @@ def endless():
 def test_files_that_are_no_tables_or_have_too_much_in_a_line_are_refused(tmp_path, name, content, said):
     content = content() if callable(content) else content
     (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-    with pytest.raises(ImportTableError, match=one_line(name, said)) as caught:
+    with pytest.raises(errors.ImportTableError, match=one_line(name, said)) as caught:
         import_recording(tmp_path / name, tmp_path / "o.uwb")
     assert len(str(caught.value)) < 3000
     assert [path.name for path in tmp_path.iterdir()] == [name]
@@ -127,10 +126,10 @@ def test_a_plug_in_that_fails_is_one_line_with_its_name(tmp_path):
     import_recording(write(tmp_path / "t.csv", wrapped(flights())), tmp_path / "t.uwb")
     with registered(IMPORTERS, Importer("flux", (".flux",), fails, "Import flux.")):
         for work in (partial(import_recording, output=tmp_path / "o.uwb"), read_source):
-            with pytest.raises(ImportTableError, match=r"'flux'.*StrangeError: no such flux") as caught:
+            with pytest.raises(errors.ImportTableError, match=r"'flux'.*StrangeError: no such flux") as caught:
                 work(tmp_path / "a.flux")
             assert isinstance(caught.value.__cause__, StrangeError)
-    said = pytest.raises(RecordingError, match=r"'flux'.*StrangeError")
+    said = pytest.raises(errors.RecordingError, match=r"'flux'.*StrangeError")
     with registered(EXPORTERS, Exporter("flux", fails, "flux")), said:
         export_recording(tmp_path / "t.uwb", tmp_path / "out", to="flux")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.flux", "t.csv", "t.uwb"]
@@ -142,7 +141,7 @@ def test_errors_name_the_given_file(tmp_path):
         return [folder / "flux.csv"], ColumnMap()
 
     (tmp_path / "a.flux").touch()
-    said = pytest.raises(ImportTableError, match=rf"^{tmp_path}/a.flux: has a header but no rows$")
+    said = pytest.raises(errors.ImportTableError, match=rf"^{tmp_path}/a.flux: has a header but no rows$")
     with registered(IMPORTERS, Importer("flux", (".flux",), None, "Import flux.", tables=tables)), said:
         import_recording(tmp_path / "a.flux", tmp_path / "o.uwb")
 
@@ -215,7 +214,7 @@ def test_a_long_table_is_the_same_a_few_rows_at_a_time(tmp_path, monkeypatch, la
 @pytest.mark.parametrize("layout", ["messages", "stamps", "parts"])
 def test_a_table_without_any_device_is_refused_with_that_reason(tmp_path, layout):
     lines = [line | {"from_id": "", "message": 1} for line in lines_of(layout)]
-    with pytest.raises(ImportTableError, match="row 2, column 'from_id'"):
+    with pytest.raises(errors.ImportTableError, match="row 2, column 'from_id'"):
         read_rows(tmp_path, lines, f'layout = "{layout}"\n[columns]\nsequence = "seq"\n')
 
 
@@ -259,3 +258,83 @@ def test_memory_does_not_grow_with_what_is_read(tmp_path, monkeypatch, form, at_
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[2] - peaks[1] < 0.7 * grown
+
+
+# A registered importer: from Python and from the command line, and errors.
+
+
+def read_blanks(source, map_file):
+    rows = [[int(cell) for cell in line.split()] for line in source.read_text().splitlines()]
+    if any(len(row) != 6 for row in rows):
+        raise errors.ImportTableError(f"{source}: expected six numbers a line")
+    one, other, tx1, rx1, tx2, rx2 = np.array(rows).T
+    more = {"map": map_file.read_text()} if map_file else {}
+    return Contents(exchanges=Exchanges.from_arrays(one, other, tx1=tx1, rx1=rx1, tx2=tx2, rx2=rx2), meta=more)
+
+
+BLANKS = Importer("blanks", (".ranges", ".ranges.txt"), read_blanks, "Import six numbers a line.", "What they mean.")
+
+
+@pytest.fixture
+def source(tmp_path):
+    (tmp_path / "my.Ranges").write_text("1 2 0 5 1005 3000\n2 3 9 3 1003 3009\n")
+    with registered(IMPORTERS, BLANKS):
+        yield tmp_path / "my.Ranges"
+
+
+def test_registered_importers_are_found_by_suffix_and_name(source, tmp_path):
+    assert import_recording(source, tmp_path / "a.uwb") == 2
+    (tmp_path / "note.txt").write_text("ticks")
+    assert import_recording(source, tmp_path / "b.uwb", importer="blanks", map_file=tmp_path / "note.txt") == 2
+    assert load(tmp_path / "b.uwb").meta["map"] == "ticks"
+    np.testing.assert_allclose(load(tmp_path / "a.uwb").exchanges.range_m, 4.690357, rtol=1e-6)
+
+
+def test_the_longest_ending_decides(tmp_path):
+    (tmp_path / "my.blanks.csv").write_text("1 2 0 5 1005 3000\n")
+    with registered(IMPORTERS, replace(BLANKS, suffixes=(".blanks.csv",))):
+        assert import_recording(tmp_path / "my.blanks.csv", tmp_path / "a.uwb") == 1
+
+
+def test_without_a_map_there_is_no_option_for_one(tmp_path):
+    with registered(IMPORTERS, replace(BLANKS, name="plain", map_help=None)):
+        assert "--map" not in processes.succeed("uwblink", "import", "plain", "--help").stdout
+        with pytest.raises(errors.ArgumentError, match="`map_file`: importer 'plain' uses none"):
+            import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb", importer="plain", map_file=tmp_path / "m")
+
+
+def test_files_that_cannot_be_imported_are_named(source, tmp_path):
+    with pytest.raises(
+        errors.ImportTableError,
+        match=r"t\.xls: no importer for this kind of file; the known ones are \.csv, \.csv\.gz, .*\.ranges",
+    ):
+        import_recording(tmp_path / "t.xls", tmp_path / "x.uwb")
+    with pytest.raises(errors.ArgumentError, match="importer: found 'xls', allowed: csv"):
+        import_recording(source, tmp_path / "x.uwb", importer="xls")
+    (tmp_path / "old.uwb").write_text("")
+    with pytest.raises(errors.RecordingExistsError):
+        import_recording(source, tmp_path / "old.uwb")
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"name": "a b"}, "name: found 'a b', expected a word"),
+        ({"name": "csv"}, "importer 'csv': this name is reserved"),
+        ({"suffixes": ".csv"}, "suffixes: found '.csv', expected a tuple"),
+        ({"suffixes": ("csv",)}, "suffixes: found .*, expected a tuple"),
+        ({"read": None}, "read: found None, expected a function"),
+        ({"help": ""}, "help: found '', expected a line of text"),
+        ({"map_help": 3}, "map_help: found 3, expected a line of text"),
+    ],
+)
+def test_wrong_importers_are_refused(change, expected):
+    with pytest.raises(errors.ArgumentError, match=expected):
+        register_importer(replace(BLANKS, **change))
+
+
+def test_a_reader_must_return_contents(tmp_path):
+    broken = replace(BLANKS, name="broken", read=lambda *_: [1, 2])  # type: ignore[arg-type]
+    said = pytest.raises(errors.ArgumentError, match=r"importer 'broken': returned \[1, 2\], expected Contents")
+    with registered(IMPORTERS, broken), said:
+        import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb")

@@ -8,13 +8,10 @@ import pytest
 
 from tests.errors import one_line
 from tests.uwblink.importers.test_bag_guess import by_guess
-from uwblink.errors import ImportTableError
+from uwblink import Contents, Exchanges, Poses, errors
 from uwblink.exporters import export_recording
 from uwblink.importers import read_source
 from uwblink.importers.poses import read_poses
-from uwblink.recording.contents import Contents
-from uwblink.recording.schema import Poses
-from uwblink.twr import Exchanges
 
 WHEN = 1_706_822_508_042_560_815
 
@@ -116,7 +113,7 @@ def posed(x=1.0, sec=1):
 )
 def test_wrong_poses_are_one_line(tmp_path, message, said):
     path = written(tmp_path / "t.mcap", {"/poses/a": [message]}, "foxglove.PoseInFrame")
-    with pytest.raises(ImportTableError, match=said):
+    with pytest.raises(errors.ImportTableError, match=said):
         read_poses(path)
 
 
@@ -131,9 +128,9 @@ def test_cut_broken_and_endless_files_are_one_line(exported, tmp_path):
     cuts = [(data[:cut], "") for cut in range(9, len(data) - 40, 1013)]
     for broken, said in (*cuts, (longest, ""), (bomb, "a chunk unpacks to 1099511627776 bytes")):
         path.write_bytes(broken)
-        with pytest.raises(ImportTableError, match=one_line("t.mcap", said)):
+        with pytest.raises(errors.ImportTableError, match=one_line("t.mcap", said)):
             read_source(path)
     path.unlink()
     # An object that is nested too deeply.
-    with pytest.raises(ImportTableError, match=one_line("t.mcap")):
+    with pytest.raises(errors.ImportTableError, match=one_line("t.mcap")):
         read_source(written(path, {"/uwb": [b'{"a":' * 700 + b"1" + b"}" * 700]}))

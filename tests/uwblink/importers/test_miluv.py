@@ -9,11 +9,9 @@ import pytest
 
 from tests.errors import one_line
 from tests.shared_data import miluv
-from uwblink.errors import ImportTableError
-from uwblink.importers import import_recording
-from uwblink.recording.contents import load
+from uwblink import errors, import_recording, load, raw_range
 from uwblink.recording.distances import distances_m
-from uwblink.twr import STAMPS, raw_range
+from uwblink.twr import STAMPS
 
 TICK_NS = 1e9 / (128 * 499.2e6)
 AIR = 299_702_547.0
@@ -169,14 +167,14 @@ def test_a_folder_that_cannot_be_used_is_one_line_and_no_file(flight, tmp_path, 
         (folder / name).write_text((folder / name).read_text().replace(there, instead))
     for path in () if name else folder.glob("*/uwb_range.csv"):
         path.unlink()
-    with pytest.raises(ImportTableError, match=one_line(text)):
+    with pytest.raises(errors.ImportTableError, match=one_line(text)):
         imported(folder, tmp_path)
     assert not (tmp_path / "o.uwb").exists()
 
 
 def test_missing_constellations_are_named(flight, tmp_path):
     for text, said in (('constellation = "7"', "there are 0, 1"), ("constellation = 7", "constellation: found 7")):
-        with pytest.raises(ImportTableError, match=said):
+        with pytest.raises(errors.ImportTableError, match=said):
             imported(flight[0], tmp_path, text)
     assert imported(flight[0], tmp_path, 'constellation = "1"').meta["anchor_constellation"] == "1"
 

@@ -9,12 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from tests import processes
 from tests.errors import one_line
-from uwblink.errors import ImportTableError
+from uwblink import Contents, Exchanges, Tag, errors, load
 from uwblink.importers.poses import read_poses
-from uwblink.recording.contents import Contents, load
 from uwblink.recording.distances import distances_m
-from uwblink.recording.schema import Tag
-from uwblink.twr import Exchanges
 
 COUNT, RATE = 30, 100.0
 TIMES = np.arange(COUNT) / RATE
@@ -230,7 +227,7 @@ def test_exports_that_lack_something_are_refused_with_its_name(tmp_path, name, b
     text = broken(tmp_path)
     if isinstance(text, str):
         (tmp_path / name).write_text(text)
-    with pytest.raises(ImportTableError, match=one_line(said)):
+    with pytest.raises(errors.ImportTableError, match=one_line(said)):
         read_poses(tmp_path / name)
 
 

@@ -10,14 +10,12 @@ import pytest
 import uwbsim
 from tests import processes
 from tests.errors import one_line
-from uwblink.errors import ImportTableError, PlanError, RecordingExistsError
+from uwblink import Contents, Exchanges, Poses, Tag, errors, load
 from uwblink.exporters import export_recording
 from uwblink.importers import add_poses
 from uwblink.importers.poses import read_poses
-from uwblink.recording.contents import Contents, load
 from uwblink.recording.distances import distances_m
-from uwblink.recording.schema import Poses, Tag
-from uwblink.twr import STAMPS, Exchanges
+from uwblink.twr import STAMPS
 from uwbsim.boards.server import LivePoses
 from uwbsim.world.world import World
 
@@ -83,7 +81,7 @@ def test_rows_in_which_motion_capture_lost_a_body_are_left_out(tmp_path, cell):
 )
 def test_files_without_poses_are_refused(tmp_path, name, text, fragment):
     (tmp_path / name).write_text(text)
-    with pytest.raises(ImportTableError, match=one_line(fragment)):
+    with pytest.raises(errors.ImportTableError, match=one_line(fragment)):
         read_poses(tmp_path / name, "drone" if "cells" in fragment else None)
 
 
@@ -124,9 +122,9 @@ def test_the_command_prints_its_result_and_refuses_wrong_options(flight, copied,
     words = ("poses", copied, "--from", flight / "p.csv", "--force")
     processes.refuse("uwblink", *words, "--offset", "soon", naming=["--offset"])
     for more, error, fragment in (
-        ({"source": tmp_path / "no.csv"}, ImportTableError, "no such file"),
-        ({"offset": "500000"}, ImportTableError, "no exchange is within"),
-        ({"tags_from": tmp_path / "no.toml"}, PlanError, "no such file"),
+        ({"source": tmp_path / "no.csv"}, errors.ImportTableError, "no such file"),
+        ({"offset": "500000"}, errors.ImportTableError, "no exchange is within"),
+        ({"tags_from": tmp_path / "no.toml"}, errors.PlanError, "no such file"),
     ):
         with pytest.raises(error, match=fragment):
             add_poses(copied, **{"source": flight / "p.csv", "force": True} | more)
@@ -146,7 +144,7 @@ def test_existing_poses_are_replaced_only_with_force(flight, copied):
     for offset, force in (("-3.21", False), ("-3.1", True)):
         add_poses(copied, flight / "p.csv", offset=offset, force=force)
         assert load(copied).meta["poses_offset_s"] == pytest.approx(float(offset))
-        with pytest.raises(RecordingExistsError, match="`force` replaces them"):
+        with pytest.raises(errors.RecordingExistsError, match="`force` replaces them"):
             add_poses(copied, flight / "p.csv", offset="-3")
 
 
@@ -163,7 +161,7 @@ def test_poses_in_other_units_are_refused(flight, copied, tmp_path, unit, factor
     other = scaled(flight / "p.csv", factor, tmp_path / "p.csv")
     before = copied.read_bytes()
     # With the wrong time, only ratios far from those of any delay show the unit.
-    with pytest.raises(ImportTableError, match="p.csv" if offset == "auto" else f"positions are in {unit}"):
+    with pytest.raises(errors.ImportTableError, match="p.csv" if offset == "auto" else f"positions are in {unit}"):
         add_poses(copied, other, offset=offset)
     assert copied.read_bytes() == before
 
@@ -176,13 +174,13 @@ def test_lever_arms_and_ranges_in_other_units_are_refused(flight, copied, tmp_pa
         for tag in tags
     ]
     (tmp_path / "tags.toml").write_text("".join(tables))
-    with pytest.raises(ImportTableError, match="lever arms are in mm"):
+    with pytest.raises(errors.ImportTableError, match="lever arms are in mm"):
         add_poses(copied, flight / "p.csv", offset="-3.21", tags_from=tmp_path / "tags.toml")
     none: dict[str, Any] = dict.fromkeys(STAMPS, np.zeros(len(held), dtype=np.int64))
     for unit, factor in (("mm", 1000.0), ("ns", 1 / 0.299702547)):
         bare = replace(held, range_m=factor * held.range_m, **none)
         Contents(exchanges=bare, tags=tags).save(tmp_path / "other.uwb", force=True)
-        with pytest.raises(ImportTableError, match=f"ranges of the recording are in {unit}"):
+        with pytest.raises(errors.ImportTableError, match=f"ranges of the recording are in {unit}"):
             add_poses(tmp_path / "other.uwb", flight / "p.csv", offset="-3.21")
 
 
@@ -267,7 +265,7 @@ def test_topics_by_body(tmp_path):
         ("bag", "'/d' is not there; topics with poses are /a/pose, /b/pose, /c/odom"),
         ("t.tum", "has no topics"),
     ):
-        with pytest.raises(ImportTableError, match=said):
+        with pytest.raises(errors.ImportTableError, match=said):
             read_poses(tmp_path / name, topics={"drone": "/d"})
 
 
@@ -322,6 +320,6 @@ def test_wrong_anchors_are_refused(recording, tmp_path):
         ("a = 3\n", "a: unknown key"),
     ):
         (tmp_path / "places.toml").write_text(text)
-        with pytest.raises(PlanError, match=one_line(fragment)):
+        with pytest.raises(errors.PlanError, match=one_line(fragment)):
             add_poses(recording, tmp_path / "car" / "car.tum", body="car", tags_from=tmp_path / "places.toml")
     assert not load(recording).poses

@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 
 from tests.errors import one_line
-from uwblink.errors import ArgumentError, ImportTableError
-from uwblink.importers import import_recording, read_source
+from uwblink import errors, import_recording, load, raw_range
+from uwblink.importers import read_source
 from uwblink.importers.tables import SourceTable, connected
-from uwblink.recording.contents import load
-from uwblink.twr import raw_range
 
 TICKS = 128 * 499_200_000
 AIR = 299_702_547.0
@@ -80,6 +78,11 @@ def same(found, rows, bits=32):
     np.testing.assert_allclose(found.exchanges.range_m, [row["truth"] for row in rows], atol=1e-9)
 
 
+@pytest.fixture
+def rows():
+    return flights()
+
+
 POSE = ("time_s", "body", "x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -102,23 +105,21 @@ def read_rows(tmp_path, rows, text=None):
 
 
 @pytest.mark.parametrize("delimiter", [";", "\t", "|"])
-def test_any_delimiter_with_a_byte_order_mark_comments_and_windows_lines(tmp_path, delimiter):
-    rows = flights()
+def test_any_delimiter_with_a_byte_order_mark_comments_and_windows_lines(tmp_path, delimiter, rows):
     path = write(tmp_path / "t.csv", wrapped(rows), delimiter)
     path.write_text("\ufeff# what this is\n" + path.read_text(), newline="\r\n")
     same(read_table(path), rows)
 
 
-def test_several_files_are_one_table(tmp_path):
-    rows = flights()
+def test_several_files_are_one_table(tmp_path, rows):
     paths = [write(tmp_path / f"{k}.csv", wrapped(rows[k::2])) for k in (0, 1)]
     same(read_table(paths), rows)
     same(read_source(paths[::-1]), rows)
     assert len(read_table(tmp_path).exchanges) == len(rows)
-    with pytest.raises(ArgumentError, match="found no files"):
+    with pytest.raises(errors.ArgumentError, match="found no files"):
         read_source([])
     write(tmp_path / "2.csv", [{"time_s": 1, "from_id": 1, "to_id": 2, "range_m": 3}])
-    with pytest.raises(ImportTableError, match="other columns than"):
+    with pytest.raises(errors.ImportTableError, match="other columns than"):
         read_table(tmp_path)
 
 
@@ -129,8 +130,7 @@ def test_several_files_are_one_table(tmp_path):
         ('"ticks"', 1, 2**60),  # which no float holds
     ],
 )
-def test_unwrapped_stamps_in_any_unit(tmp_path, unit, scale, after):
-    rows = flights()
+def test_unwrapped_stamps_in_any_unit(tmp_path, unit, scale, after, rows):
     scaled = [{n: repr(v * scale) if n in HEADER[3:9] else v for n, v in later(row, after).items()} for row in rows]
     found = read_rows(tmp_path, [{n: row[n] for n in HEADER} for row in scaled], f"[units]\nstamps = {unit}\n")
     # The first stamp of a clock has the rounding error of a float of so many seconds; the following intervals do not.
@@ -175,7 +175,7 @@ def test_the_protocol_is_found_by_the_stamps(tmp_path):
     ],
 )
 def test_tables_that_cannot_be_meant_are_refused_with_the_reason(tmp_path, rows, text, said):
-    with pytest.raises(ImportTableError, match=said):
+    with pytest.raises(errors.ImportTableError, match=said):
         read_rows(tmp_path, rows, text)
 
 
@@ -221,14 +221,13 @@ def test_iso_times_names_and_programmed_delays(tmp_path):
     assert abs(int(found.exchanges.time_ns[0]) - 1714972090_000000000) < 1000
 
 
-def test_unused_repeated_headers_are_accepted(tmp_path):
-    rows = flights()
+def test_unused_repeated_headers_are_accepted(tmp_path, rows):
     lines = write(tmp_path / "t.csv", wrapped(rows)).read_text().splitlines()
     (tmp_path / "t.csv").write_text(
         "\n".join(f"{'note,note' if k == 0 else 'a,b'},{line}" for k, line in enumerate(lines))
     )
     same(read_table(tmp_path / "t.csv"), rows)
-    with pytest.raises(ImportTableError, match="two columns are called 'note'"):
+    with pytest.raises(errors.ImportTableError, match="two columns are called 'note'"):
         read_table(tmp_path / "t.csv", mapped(tmp_path, '[columns]\nskew1 = "note"\n'))
 
 
@@ -266,7 +265,7 @@ def test_ranges_without_stamps_with_total_powers_and_places(tmp_path, unit, scal
 def test_the_column_in_another_unit_is_named_with_its_line_of_the_map(tmp_path, column, other):
     rows = [{"from_id": 7, "to_id": 8, "range_m": 2.3 + 0.1 * k, "gt_range_m": 2 + 0.1 * k} for k in range(30)]
     scaled = [row | {column: row[column] / 0.3048} for row in rows]
-    with pytest.raises(ImportTableError, match=f"in ft according to the {other}.* write units.{column} = 'ft'"):
+    with pytest.raises(errors.ImportTableError, match=f"in ft according to the {other}.* write units.{column} = 'ft'"):
         read_rows(tmp_path, scaled)
     found = read_rows(tmp_path, scaled, f"[units]\n{column} = 'ft'\n").exchanges
     np.testing.assert_allclose(found.range_m - found.truth_m, 0.3, atol=1e-6)
@@ -359,7 +358,7 @@ def test_no_text_of_a_map_is_a_program(tmp_path, monkeypatch):
         if place.startswith(("[constants]\nfrom_id", "[ids]")):  # only the name of a device can be any text
             assert len(read_table(tmp_path / "t.csv", map_file).exchanges) == 60
         else:
-            with pytest.raises(ImportTableError, match=one_line()):
+            with pytest.raises(errors.ImportTableError, match=one_line()):
                 read_table(tmp_path / "t.csv", map_file)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.toml", "t.csv"]
 
@@ -398,7 +397,7 @@ def test_duckdb_may_open_the_named_file_only(tmp_path):
 )
 def test_wrong_maps_are_refused(tmp_path, text, fragment):
     write(tmp_path / "t.csv", wrapped(flights()))
-    with pytest.raises(ImportTableError, match=one_line(fragment)):
+    with pytest.raises(errors.ImportTableError, match=one_line(fragment)):
         import_recording(tmp_path / "t.csv", tmp_path / "o.uwb", map_file=mapped(tmp_path, text))
     assert not (tmp_path / "o.uwb").exists()
 

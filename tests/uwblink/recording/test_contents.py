@@ -8,14 +8,10 @@ import numpy as np
 import pytest
 
 from tests.uwblink.recording.test_file import random_exchanges
-from uwblink import exporters
-from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError
-from uwblink.exporters import export_recording, mcap
-from uwblink.recording.contents import Contents, exchanges_with_poses, load, pieces
-from uwblink.recording.distances import distances_m
-from uwblink.recording.file import Recording
-from uwblink.recording.schema import TABLES, Arrangement, CirRow, Fault, FrameRow, KnownDistance, Poses, Tag
-from uwblink.twr import Exchanges
+from uwblink import Arrangement, Contents, Exchanges, KnownDistance, Poses, Recording, Tag, errors, exporters, load
+from uwblink.recording.contents import exchanges_with_poses, pieces
+from uwblink.recording.distances import distances_m, poses_around, tracks_of
+from uwblink.recording.schema import TABLES, CirRow, Fault, FrameRow
 
 HEARD = {name: 7.5 if kind == "DOUBLE" else 3 for name, kind in TABLES["overheard"].items()}
 CIRS = [
@@ -127,9 +123,9 @@ def test_entries_of_meta_are_added_or_replaced(full, tmp_path):
 
 def test_mistakes_are_one_line_and_leave_nothing(full, tmp_path):
     with Recording.open(full) as source:
-        with pytest.raises(RecordingError, match="no table 'ranges' in a recording; there are meta, tags"):
+        with pytest.raises(errors.RecordingError, match="no table 'ranges' in a recording; there are meta, tags"):
             source.copy(tmp_path / "copy.uwb", replacing={"ranges": []})
-        with pytest.raises(RecordingExistsError):
+        with pytest.raises(errors.RecordingExistsError):
             source.copy(full)
     assert not list(tmp_path.iterdir())
 
@@ -217,7 +213,7 @@ def test_it_prints_itself_on_a_screen():
     ],
 )
 def test_wrong_selections_are_refused(wrong, expected):
-    with pytest.raises(ArgumentError, match=expected):
+    with pytest.raises(errors.ArgumentError, match=expected):
         made().select(**wrong)
 
 
@@ -277,12 +273,13 @@ def test_corrections_of_other_exchanges_are_left_out(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("to", "module"), [("mcap", mcap), ("tum", exporters), pytest.param("rosbag2", mcap, marks=pytest.mark.slow)]
+    ("to", "module"),
+    [("mcap", exporters.mcap), ("tum", exporters), pytest.param("rosbag2", exporters.mcap, marks=pytest.mark.slow)],
 )
 def test_an_export_does_not_depend_on_the_pieces(timed, tmp_path, monkeypatch, to, module):
-    as_one = export_recording(timed, tmp_path / "one", to=to)
+    as_one = exporters.export_recording(timed, tmp_path / "one", to=to)
     monkeypatch.setattr(module, "pieces", partial(pieces, rows=120))
-    assert export_recording(timed, tmp_path / "many", to=to) == as_one
+    assert exporters.export_recording(timed, tmp_path / "many", to=to) == as_one
     files = [sorted(p for p in (tmp_path / name).rglob("*") if p.is_file()) for name in ("one", "many")]
     assert len(files[0]) == len(files[1]) > 0
     for one, other in zip(*files, strict=True):
@@ -309,3 +306,46 @@ def test_a_recording_without_exchanges_has_no_stretches(tmp_path):
         assert recording.dividing_times("exchanges", 50) == []
     with Recording.open(tmp_path / "empty.uwb") as recording:
         assert recording.show().span_s == 0.0
+
+
+# True distances from poses and lever arms.
+
+
+LEVEL = (0, 0, 0, 1)
+YAW_90 = (0, 0, np.sqrt(0.5), np.sqrt(0.5))
+NEGATED = tuple(-q for q in YAW_90)
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "stands", "time_ns", "expected"),
+    [
+        # At half of the time, body a is at (1, 0, 0), and its arm, rotated by 90 degrees, points along y.
+        (((0, 0, 0), YAW_90), ((2, 0, 0), YAW_90), (1, 4, 0), 50, 3.0),
+        (((0, 0, 0), YAW_90), ((0, 0, 0), NEGATED), (0, 4, 0), 50, 3.0),
+        (((0, 0, 0), LEVEL), ((0, 0, 0), LEVEL), (0, 4, 0), -1, np.nan),
+        (((0, 0, 0), LEVEL), ((0, 0, 0), LEVEL), (0, 4, 0), 101, np.nan),
+    ],
+    ids=["between poses", "both signs of a quaternion", "before the poses", "after the poses"],
+)
+def test_distances_are_those_of_antennas_on_their_way(begin, end, stands, time_ns, expected):
+    position, quaternion = zip(begin, end, (stands, LEVEL), strict=True)
+    poses = Poses.from_arrays([0, 100, 0], ["a", "a", "b"], position, quaternion)
+    tags = [Tag(1, "a", (1.0, 0.0, 0.0)), Tag(2, "b", (0.0, 0.0, 0.0))]
+    (found,) = distances_m(poses, tags, np.array([1]), np.array([2]), np.array([time_ns]))
+    assert found == pytest.approx(expected, nan_ok=True)
+
+
+@pytest.mark.parametrize(("step_m", "stands"), [(0.1, False), (0.0, True)])
+def test_positions_in_gaps_of_poses_are_unknown(step_m, stands):
+    seconds = np.r_[0:2:0.1, 5:7:0.1]
+    poses = Poses.from_arrays(
+        [*(seconds * 1e9).astype(int), 0],
+        ["a"] * len(seconds) + ["b"],
+        [*((step_m * k, 0, 0) for k in range(len(seconds))), (0, 4, 0)],
+    )
+    tags, ones = [Tag(1, "a", (0.0, 0.0, 0.0)), Tag(2, "b", (0.0, 0.0, 0.0))], np.ones(4, np.int64)
+    at_ns = np.array([1_500_000_000, 1_950_000_000, 3_000_000_000, 6_000_000_000])
+    for some in (poses, poses_around(tracks_of(poses), 2_500_000_000, 3_500_000_000)):
+        lost = ~np.isfinite(distances_m(some, tags, ones, 2 * ones, at_ns))
+        assert lost[1:3].tolist() == [not stands] * 2
+    assert np.isfinite(distances_m(poses, tags, ones, 2 * ones, at_ns))[[0, 3]].all()

@@ -15,12 +15,9 @@ import pytest
 from tests import processes
 from tests.boards import record_bench
 from tests.errors import one_line
-from uwblink import Listener, RangingPlan
-from uwblink.errors import RecordingError, RecordingExistsError, RecordingInUseError, RecordingMissingError
-from uwblink.recording.contents import Contents, load
-from uwblink.recording.file import Recording
-from uwblink.recording.schema import TABLES, CirRow, Fault, Poses, Tag
-from uwblink.twr import COLUMNS, Exchanges
+from uwblink import Contents, Exchanges, Listener, Poses, RangingPlan, Recording, Tag, errors, load
+from uwblink.recording.schema import TABLES, CirRow, Fault
+from uwblink.twr import COLUMNS
 
 
 def random_exchanges(n=50, seed=1):
@@ -59,10 +56,10 @@ LATER = ("imu", "height", "powers", "quality", "temperature", "receptions", "dif
 
 
 def test_an_existing_file_is_not_replaced_without_force(recording, tmp_path):
-    with pytest.raises(RecordingMissingError, match="no such recording"):
+    with pytest.raises(errors.RecordingMissingError, match="no such recording"):
         Recording.open(tmp_path / "no.uwb")
     before = recording.read_bytes()
-    with pytest.raises(RecordingExistsError, match="or replace it with `force`"):
+    with pytest.raises(errors.RecordingExistsError, match="or replace it with `force`"):
         Recording.create(recording)
     assert recording.read_bytes() == before
     Contents(exchanges=random_exchanges(0)).save(recording, force=True)
@@ -80,7 +77,7 @@ def test_a_failed_block_leaves_no_file(tmp_path):
 def test_a_truncated_recording_is_one_clear_error(recording, tmp_path, share):
     content = recording.read_bytes()
     (tmp_path / "cut.uwb").write_bytes(content[: int(len(content) * share)])
-    with pytest.raises(RecordingError, match=r"cut\.uwb"):
+    with pytest.raises(errors.RecordingError, match=r"cut\.uwb"):
         load(tmp_path / "cut.uwb")
 
 
@@ -100,7 +97,7 @@ def test_a_truncated_recording_is_one_clear_error(recording, tmp_path, share):
 def test_wrong_tables_and_newer_versions(recording, statement, said):
     """Tables of `LATER` may be missing, but not some of their columns."""
     change(recording, statement)
-    with pytest.raises(RecordingError, match=said):
+    with pytest.raises(errors.RecordingError, match=said):
         Recording.open(recording)
 
 
@@ -128,7 +125,7 @@ def test_files_in_use_are_named(recording, held):
     words = [sys.executable, "-c", HOLDER, str(recording), held]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "open\n"
-        with pytest.raises(RecordingError, match="another process has it open"):
+        with pytest.raises(errors.RecordingError, match="another process has it open"):
             Recording.open(recording, update=True)
         process.stdin.close()
         process.wait()
@@ -136,24 +133,31 @@ def test_files_in_use_are_named(recording, held):
         assert r.count("exchanges") == 50
 
 
-def test_a_damaged_file_with_the_word_lock_in_its_path_is_damaged(recording, tmp_path):
-    (tmp_path / "blocks.uwb").write_bytes(b"\0" * recording.stat().st_size)
-    with pytest.raises(RecordingError, match=r"not a \.uwb recording, or a truncated one"):
-        Recording.open(tmp_path / "blocks.uwb")
+SIZE = 3 * 4096 + 16384
+"""Of a database."""
 
 
-@pytest.mark.parametrize(("name", "command"), [("t.csv", "csv"), ("t.csv.gz", "csv"), ("t.MCAP", "bag")])
-@pytest.mark.parametrize("size", [100, 3 * 4096 + 16384])  # an odd number of bytes, and the size of a database
-def test_errors_for_tables_name_the_import(tmp_path, name, command, size):
-    (tmp_path / name).write_bytes(b"a" * size)
-    with pytest.raises(RecordingError, match=f"{name}: is not a recording; convert it with `uwblink import {command}`"):
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("blocks.uwb", bytes(SIZE), r"not a \.uwb recording, or a truncated one"),  # though its path has the word lock
+        *(
+            (name, b"a" * size, f"{name}: is not a recording; convert it with `uwblink import {command}`")
+            for name, command in (("t.csv", "csv"), ("t.csv.gz", "csv"), ("t.MCAP", "bag"))
+            for size in (100, SIZE)
+        ),
+    ],
+)
+def test_damaged_files_are_called_damaged_and_errors_for_tables_name_the_import(tmp_path, name, content, said):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(errors.RecordingError, match=said):
         Recording.open(tmp_path / name)
 
 
 def test_recordings_that_are_being_written_are_named(tmp_path):
     with (
         Recording.create(tmp_path / "live.uwb", live=True),
-        pytest.raises(RecordingError, match="open in this program"),
+        pytest.raises(errors.RecordingError, match="open in this program"),
     ):
         Recording.open(tmp_path / "live.uwb")
 
@@ -182,7 +186,7 @@ def test_recordings_that_are_being_written_are_named(tmp_path):
 def test_values_that_do_not_fit_undo_their_transaction(tmp_path, write, expected):
     with Recording.create(tmp_path / "f.uwb", live=True) as r:
         r.append_exchanges(random_exchanges(7))
-        with pytest.raises(RecordingError, match=one_line(expected)), r.transaction():
+        with pytest.raises(errors.RecordingError, match=one_line(expected)), r.transaction():
             r.append_exchanges(random_exchanges(5))
             write(r)
         assert r.count("exchanges") == 7
@@ -268,7 +272,7 @@ def test_what_any_writer_has_committed_is_read_and_not_updated(writer):
     with Recording.open(writer) as recording:
         assert [fault.detail for fault in recording.faults()] == [f"row {k}" for k in range(50)]
         assert recording.path == writer
-    with pytest.raises(RecordingInUseError, match="has it open; wait"):
+    with pytest.raises(errors.RecordingInUseError, match="has it open; wait"):
         Recording.open(writer, update=True)
     assert sorted(p.name for p in writer.parent.iterdir()) == ["f.uwb", "f.uwb.wal"]
 
@@ -293,6 +297,8 @@ def test_failed_copies_are_errors_of_the_reader_only(writer, monkeypatch, changi
 
     monkeypatch.setattr("shutil.copyfile", copy)
     why = "changes faster than it can be copied" if changing else r"cannot be copied \(No space left on device\)"
-    with pytest.raises(RecordingInUseError, match=f"another process is writing it, and it {why}; wait until that"):
+    with pytest.raises(
+        errors.RecordingInUseError, match=f"another process is writing it, and it {why}; wait until that"
+    ):
         Recording.open(writer)
     assert sorted(p.name for p in writer.parent.iterdir()) == ["f.uwb", "f.uwb.wal"]

@@ -9,12 +9,9 @@ import pytest
 
 from tests.errors import one_line
 from tests.uwblink.recording.test_file import change, random_exchanges
-from uwblink.errors import RecordingError
+from uwblink import Contents, Recording, Tag, errors
 from uwblink.exporters import export_recording
 from uwblink.recording import store
-from uwblink.recording.contents import Contents
-from uwblink.recording.file import Recording
-from uwblink.recording.schema import Tag
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +71,7 @@ ENDLESS = (
 def test_programs_in_a_file_are_refused_in_one_line(file, statements, named):
     """Files are opened for reading, and those with two statements for updating."""
     change(file, *statements)
-    with pytest.raises(RecordingError, match=one_line("stranger.uwb", named)):
+    with pytest.raises(errors.RecordingError, match=one_line("stranger.uwb", named)):
         Recording.open(file, update=len(statements) == 2)
 
 
@@ -87,7 +84,7 @@ def test_a_trigger_in_a_file_is_refused(file, tmp_path):
         db.execute("COPY FROM DATABASE plain TO stranger")
         db.execute("USE stranger")
         db.execute("CREATE TRIGGER t AFTER INSERT ON poses FOR EACH STATEMENT DELETE FROM tags")
-    with pytest.raises(RecordingError, match=r"stranger2\.uwb: contains a trigger, t;"):
+    with pytest.raises(errors.RecordingError, match=r"stranger2\.uwb: contains a trigger, t;"):
         Recording.open(tmp_path / "stranger2.uwb", update=True)
 
 
@@ -101,7 +98,7 @@ def test_recordings_may_have_names_of_databases(file, tmp_path):
 
 def test_an_export_looks_the_file_over_too(file, tmp_path):
     change(file, "DROP TABLE poses", "CREATE VIEW poses AS SELECT 1 AS time_ns")
-    with pytest.raises(RecordingError, match="a view, poses"):
+    with pytest.raises(errors.RecordingError, match="a view, poses"):
         export_recording(file, tmp_path / "out", to="csv")
     assert not (tmp_path / "out").exists()
 
@@ -118,7 +115,7 @@ def test_writers_use_only_the_folder_of_the_recording(tmp_path):
     (tmp_path / "here").mkdir()
     with (
         Recording.create(tmp_path / "here" / "new.uwb", live=True) as recording,
-        pytest.raises(RecordingError, match=r"new.uwb: cannot be written any more .*disabled"),
+        pytest.raises(errors.RecordingError, match=r"new.uwb: cannot be written any more .*disabled"),
     ):
         recording._execute(f"ATTACH '{tmp_path / 'elsewhere.uwb'}' AS elsewhere")
     assert not (tmp_path / "elsewhere.uwb").exists()
@@ -130,13 +127,7 @@ def test_more_rows_than_a_file_can_hold_are_not_read(file, monkeypatch):
     with Recording.open(file) as recording:
         assert recording.count("height") == 3_000_000
     monkeypatch.setattr(store, "ROWS_OF_ANY_FILE", 2_000_000)
-    with pytest.raises(RecordingError, match="table height holds 3000000 rows"):
-        Recording.open(file)
-
-
-def test_meta_is_bounded_in_bytes(file):
-    change(file, f"INSERT INTO meta SELECT 'big', repeat('9', {store.MOST_META_BYTES})")
-    with pytest.raises(RecordingError, match=r"table meta holds 64\d+ bytes, at most 64000000"):
+    with pytest.raises(errors.RecordingError, match="table height holds 3000000 rows"):
         Recording.open(file)
 
 
@@ -149,39 +140,51 @@ def test_meta_is_bounded_in_bytes(file):
         ("'[1, -1e400]'", "that of x"),
         (f"'{'[' * 100_000}'", "that of x"),
         ("'{'", "that of x"),
+        (f"repeat('9', {store.MOST_META_BYTES})", r"table meta holds 64\d+ bytes, at most 64000000"),
     ],
 )
-def test_wrong_json_in_meta_is_refused(file, value, expected):
+def test_wrong_json_and_too_many_bytes_in_meta_are_refused(file, value, expected):
     change(file, f"INSERT INTO meta VALUES ('x', {value})")
-    with pytest.raises(RecordingError, match=expected) as caught:
+    with pytest.raises(errors.RecordingError, match=expected) as caught:
         Recording.open(file)
     assert len(str(caught.value)) < 300
 
 
 @pytest.mark.parametrize(
-    ("table", "row"),
-    [("tags", "2, NULL, 0, 0, 0"), ("cirs", "9, 1, 1, 2, NULL, NULL"), ("faults", "9, NULL, 'power', '', NULL, 3")],
+    ("table", "statement", "said"),
+    [
+        *(
+            (table, f"INSERT INTO {table} VALUES ({row})", f"table {table}: a row with nothing")
+            for table, row in (
+                ("tags", "2, NULL, 0, 0, 0"),
+                ("cirs", "9, 1, 1, 2, NULL, NULL"),
+                ("faults", "9, NULL, 'power', '', NULL, 3"),
+            )
+        ),
+        *(
+            ("arrangements", f"INSERT INTO arrangements VALUES (0, 1, 'A', '{known}')", "known: found")
+            for known in ("line 1 1", "plane 1 2", "line 1 b", "line  1")
+        ),
+        *(
+            (
+                "exchanges",
+                f"UPDATE meta SET value = '{json.dumps(bits)}' WHERE key = 'timestamp_bits'",
+                r"timestamp_bits is .*expected 32 or 40",
+            )
+            for bits in (0, -1, 33, 64, 10**30, True, None, "32", [32], 32.5)
+        ),
+    ],
 )
-def test_rows_with_missing_values_are_refused(file, table, row):
-    change(file, f"INSERT INTO {table} VALUES ({row})")
-    with Recording.open(file) as recording, pytest.raises(RecordingError, match=f"table {table}: a row with nothing"):
+def test_missing_values_wrong_orders_and_widths_of_stamps_are_refused_when_they_are_read(file, table, statement, said):
+    change(file, statement)
+    with Recording.open(file) as recording, pytest.raises(errors.RecordingError, match=said):
         getattr(recording, table)()
-
-
-@pytest.mark.parametrize("bits", [0, -1, 33, 64, 10**30, True, None, "32", [32], 32.5])
-def test_wrong_widths_of_stamps_are_refused(file, bits):
-    change(file, f"UPDATE meta SET value = '{json.dumps(bits)}' WHERE key = 'timestamp_bits'")
-    with (
-        Recording.open(file) as recording,
-        pytest.raises(RecordingError, match=r"timestamp_bits is .*expected 32 or 40"),
-    ):
-        recording.exchanges()
 
 
 def test_endless_reads_are_interrupted(file):
     recording = Recording.open(file)
     recording._longest_read_s = 0.3
-    with pytest.raises(RecordingError, match="took longer than 0 s"):
+    with pytest.raises(errors.RecordingError, match="took longer than 0 s"):
         recording._select("SELECT sum(a.range * b.range) FROM range(10000000) a, range(10000000) b")
     recording._longest_read_s = 60.0
     assert recording._select("SELECT 1 AS one")["one"].tolist() == [1]

@@ -10,14 +10,11 @@ from rich.console import Console
 
 import calib
 import uwblink
-from calib.checks.examine import examine
 from tests.boards import bench_scenario, record_bench
 from tests.uwblink.recording.test_file import random_exchanges
 from uwblink.boards.listeners import ReportCheck
 from uwblink.cli.commands import print_summary
-from uwblink.recording.contents import Contents
-from uwblink.recording.file import Recording
-from uwblink.recording.schema import Fault, Tag
+from uwblink.recording.schema import Fault
 from uwblink.recording.summary import (
     clock_skews,
     differences,
@@ -26,18 +23,18 @@ from uwblink.recording.summary import (
     skew_summary,
     summarize,
 )
-from uwblink.twr import COLUMNS, STAMPS, Exchanges
+from uwblink.twr import COLUMNS, STAMPS
 from uwblink.wire.messages import RangeReport, TargetRangeReport
-from uwbsim.boards.virtual_board import VirtualPorts
+from uwbsim import VirtualPorts
 
 
 @pytest.fixture
 def summary(tmp_path):
-    with Recording.create(tmp_path / "f.uwb", meta={"note": "[bold]x[/] \x1b[31m", "scenario": "long"}) as r:
+    with uwblink.Recording.create(tmp_path / "f.uwb", meta={"note": "[bold]x[/] \x1b[31m", "scenario": "long"}) as r:
         r.append_exchanges(random_exchanges(50))
-        r.append_tags([Tag(3, "b", (0.1, 0.2, 0.3))])
+        r.append_tags([uwblink.Tag(3, "b", (0.1, 0.2, 0.3))])
         r.append("faults", [Fault(9, "1", "time-out", "no answer"), Fault(10, "1", "time-out", "")])
-    with Recording.open(tmp_path / "f.uwb") as r:
+    with uwblink.Recording.open(tmp_path / "f.uwb") as r:
         return r.show()
 
 
@@ -54,10 +51,10 @@ def test_printed_text_from_a_file_cannot_format_or_steer_the_terminal(summary):
 
 
 def test_a_summary_fits_on_a_screen_and_cannot_steer_it(tmp_path):
-    tags = [Tag(k, "\x1b[31m" + "b" * 200, (0.0, 0.0, 0.0)) for k in range(40)]
+    tags = [uwblink.Tag(k, "\x1b[31m" + "b" * 200, (0.0, 0.0, 0.0)) for k in range(40)]
     faults = [Fault(k, "1", f"kind {k}" * 10, "", 1, 2) for k in range(40)]
-    Contents(exchanges=random_exchanges(500), tags=tags, faults=faults).save(tmp_path / "\x1b[2J.uwb")
-    with Recording.open(tmp_path / "\x1b[2J.uwb") as r:
+    uwblink.Contents(exchanges=random_exchanges(500), tags=tags, faults=faults).save(tmp_path / "\x1b[2J.uwb")
+    with uwblink.Recording.open(tmp_path / "\x1b[2J.uwb") as r:
         summary = r.show()
     text, html = str(summary), summary._repr_html_()
     lines = text.splitlines()
@@ -97,7 +94,7 @@ def ranged(protocol, sign=1.0, carriers=True, warmer_ppm=0.0):
     columns = {name: stamp(tag, after) % 2**32 for name, tag, after in zip(STAMPS, ends, after_s, strict=True)}
     relative = fast[second] - fast[first]
     skews = {"skew1_ppm": sign * relative, "skew2_ppm": -sign * relative} if carriers else {}
-    return Exchanges.from_arrays(first, second, **columns, **skews, protocol=np.full(len(pairs), protocol))
+    return uwblink.Exchanges.from_arrays(first, second, **columns, **skews, protocol=np.full(len(pairs), protocol))
 
 
 @pytest.mark.parametrize("protocol", ["ds", "ds-alt"])
@@ -134,7 +131,7 @@ def test_drifting_clocks_appear_in_their_pairs():
 def test_single_sided_exchanges_have_no_skews():
     e = ranged("ds")
     columns = {name: getattr(e, name) for name in ("tx1", "rx1", "tx2", "rx2")}
-    assert clock_skews(Exchanges.from_arrays(e.initiator, e.target, **columns)) == []
+    assert clock_skews(uwblink.Exchanges.from_arrays(e.initiator, e.target, **columns)) == []
 
 
 # An exchange is counted once, whoever reported it.
@@ -156,7 +153,7 @@ def both(tmp_path_factory):
 
 
 def rewritten(source, output, exchanges):
-    with Recording.open(source) as recording:
+    with uwblink.Recording.open(source) as recording:
         recording.copy(output, replacing={"exchanges": exchanges})
 
 
@@ -202,7 +199,7 @@ def test_equal_stamps_of_another_time_are_another_exchange(exchanges):
 
 
 def test_show_calibration_and_doctor_count_it_once(both):
-    with Recording.open(both / "both.uwb") as recording:
+    with uwblink.Recording.open(both / "both.uwb") as recording:
         summary = summarize(recording)
         exchanges = single_reports(recording.exchanges()).exchanges
         failed = sum("failed" in fault.kind for fault in recording.faults())
@@ -210,16 +207,16 @@ def test_show_calibration_and_doctor_count_it_once(both):
     assert sum(p.failed for p in summary.pairs) == failed > 0
     assert (summary.reported_twice > 75, summary.contradictory) == (True, 0)
     assert len(calib.load_ranges(both / "both.uwb")) == len(exchanges)
-    assert not any("contradicting" in finding.fault for finding in examine(both / "both.uwb"))
+    assert not any("contradicting" in finding.fault for finding in calib.examine(both / "both.uwb"))
 
 
 def test_the_doctor_names_reports_that_contradict_each_other(both, exchanges, tmp_path):
     path = tmp_path / "f.uwb"
     wrong = (exchanges.reporter == exchanges.target) & (exchanges.initiator == 1)
     rewritten(both / "both.uwb", path, replace(exchanges, range_m=exchanges.range_m + wrong))
-    with Recording.open(path) as recording:
+    with uwblink.Recording.open(path) as recording:
         assert recording.show().contradictory == np.count_nonzero(wrong)
-    assert "the first: range_m" in next(f for f in examine(path) if f.fault == "contradicting reports").evidence
+    assert "the first: range_m" in next(f for f in calib.examine(path) if f.fault == "contradicting reports").evidence
 
 
 REPORT = RangeReport(2, 3.0, 100, 200, 300, 400, 500, 600, -80.0, -81.0, 1.0, -1.0)

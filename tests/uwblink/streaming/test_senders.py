@@ -16,7 +16,6 @@ import uwblink
 from tests.boards import bench_scenario, served
 from tests.processes import BIN
 from tests.uwblink.streaming.clients import FoxgloveClient
-from uwblink.errors import PortError
 from uwblink.streaming import FoxgloveServer, StreamedRange, UdpSender
 from uwbsim.boards.virtual_board import VirtualPorts
 
@@ -161,10 +160,10 @@ def test_a_port_without_a_host_is_of_this_computer_alone(address):
 
 
 def test_used_ports_and_missing_extras_are_named(monkeypatch):
-    with FoxgloveServer("0") as server, pytest.raises(PortError, match="cannot be served there"):
+    with FoxgloveServer("0") as server, pytest.raises(uwblink.errors.PortError, match="cannot be served there"):
         FoxgloveServer(server.url.removeprefix("ws://"))
     monkeypatch.setitem(sys.modules, "foxglove", None)
-    with pytest.raises(PortError, match=r"pip install 'uwbcal\[foxglove\]'"):
+    with pytest.raises(uwblink.errors.PortError, match=r"pip install 'uwbcal\[foxglove\]'"):
         FoxgloveServer("0")
 
 

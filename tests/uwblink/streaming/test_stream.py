@@ -15,9 +15,7 @@ import calib
 import uwblink
 from tests import processes
 from tests.boards import bench_scenario, record_bench, served
-from tests.processes import BIN
 from uwblink.boards import Progress
-from uwblink.errors import ArgumentError, PlanError, PortError
 from uwblink.streaming import RangeListener
 from uwblink.twr import STAMPS
 from uwbsim.boards.virtual_board import VirtualPorts
@@ -115,7 +113,7 @@ def test_a_recording_of_another_protocol_and_stamp_size_is_corrected_as_apply_do
 def test_uncalibrated_tags_are_named_before_the_first_range(tmp_path, flown, of_two):
     with pytest.raises(ValueError, match=r"two\.json: no delay of tag 3"):
         uwblink.stream(flown, calibration=of_two)
-    with pytest.raises(PlanError, match="no delay of tag 3"):
+    with pytest.raises(uwblink.errors.PlanError, match="no delay of tag 3"):
         record_bench(tmp_path / "g.uwb", listeners=[RangeListener(print, of_two)])
     assert not list(tmp_path.iterdir()), "nothing was written"
     found = list(from_boards(pairs=((1, 2),), calibration=of_two, duration_s=1.0))
@@ -163,17 +161,17 @@ def test_a_recording_plays_in_its_own_time(flown, clock):
     ],
 )
 def test_wrong_arguments_are_refused_before_the_first_range(flown, more, named):
-    with pytest.raises((ArgumentError, PlanError), match=named):
+    with pytest.raises((uwblink.errors.ArgumentError, uwblink.errors.PlanError), match=named):
         uwblink.stream(flown, **more)
 
 
 def test_ports_that_are_not_there_and_ranges_that_are_corrected_already(tmp_path, flown, calibration):
-    with pytest.raises(PortError, match="no such port"):
+    with pytest.raises(uwblink.errors.PortError, match="no such port"):
         uwblink.stream(["/dev/nothing", "/dev/nobody"])
     shutil.copy(flown, tmp_path / "f.uwb")
     with uwblink.Recording.open(tmp_path / "f.uwb", update=True) as opened:
         opened.append_meta({"calibration": {}})
-    with pytest.raises(ArgumentError, match="already corrected"):
+    with pytest.raises(uwblink.errors.ArgumentError, match="already corrected"):
         uwblink.stream(tmp_path / "f.uwb", calibration=calibration)
 
 
@@ -202,7 +200,7 @@ def test_the_commands_refuse_a_calibration_of_other_boards_and_write_nothing(tmp
 
 @pytest.mark.slow
 def test_a_stream_ends_if_its_reader_closes_the_pipe(flown):
-    words = f"{BIN / 'uwblink'} stream {flown} --speed 20 | head -n 2"
+    words = f"{processes.BIN / 'uwblink'} stream {flown} --speed 20 | head -n 2"
     done = subprocess.run(["bash", "-c", words], capture_output=True, text=True, timeout=120)
     assert (done.stdout.count("\n"), "Traceback" in done.stderr) == (2, False)
 

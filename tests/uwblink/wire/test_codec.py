@@ -15,7 +15,6 @@ from uwblink.twr import board_range, raw_range
 from uwblink.wire import messages as m
 from uwblink.wire.codec import LONGEST_LINE, Decoder, encode, exchanges_of
 from uwblink.wire.fields import BOOL, BYTES, ID, INT, PRINTED, RAW_FLOAT, STAMP, TEXT, Malformed, write_printed
-from uwblink.wire.messages import COMMANDS, REPORTS, Message, RangeReport, Skipped, message, register_message, wire
 
 REPORTED = [data for _, data in transcripts.captured("->host")]
 COMMANDED = [data for _, data in transcripts.captured("<-host")]
@@ -160,22 +159,6 @@ def test_printed_numbers_are_cut_towards_zero(value, stamp):
     assert [encode(message) for message in decode(data, m.REPORTS)] == [data]
 
 
-@pytest.mark.parametrize(
-    ("message", "text"),
-    [
-        (m.Broadcast(bytes(93)), "C06 data: found 93 bytes, at most 92"),
-        (m.DoTests(1, "a|b", True, 1.0, b""), "C03 text: found 'a|b'"),
-        (m.DoTests(1, "a", True, 1e60, b""), "C03 number: found 1e+60"),
-        (m.RangeCommand(300), "C05 target: found 300"),
-        (m.IdReport(-1), "R01 board: found -1"),
-        (m.RangeReport(1, float("nan"), *[0] * 6, *[0.0] * 4), "R05 range_m: found nan"),
-    ],
-)
-def test_values_that_do_not_fit_are_refused(message, text):
-    with pytest.raises(FrameError, match=one_line(text)):
-        encode(message)
-
-
 # Ends of fields, lines and messages: the last accepted value, and the first refused one.
 
 
@@ -279,6 +262,17 @@ def test_numbers_are_printed_below_ten_billion_and_cut():
         (BOOL.write, 1, None),
         (TEXT.write, "a" * 200, "expected at most 199 bytes of text"),
         (BYTES.write, bytes(1001), "1001 bytes, at most 1000"),
+        *(
+            (encode, message, one_line(text))
+            for message, text in (
+                (m.Broadcast(bytes(93)), "C06 data: found 93 bytes, at most 92"),
+                (m.DoTests(1, "a|b", True, 1.0, b""), "C03 text: found 'a|b'"),
+                (m.DoTests(1, "a", True, 1e60, b""), "C03 number: found 1e+60"),
+                (m.RangeCommand(300), "C05 target: found 300"),
+                (m.IdReport(-1), "R01 board: found -1"),
+                (m.RangeReport(1, float("nan"), *[0] * 6, *[0.0] * 4), "R05 range_m: found nan"),
+            )
+        ),
     ],
 )
 def test_values_that_cannot_be_written_are_refused(write, value, said):
@@ -354,7 +348,7 @@ def test_one_percent_of_damaged_bytes(seed):
     ends = np.cumsum([len(t) for t in texts])[:-1]
     touched = np.array([changed.any() for changed in np.split(damaged != whole, ends)])
     assert 0.5 < touched.mean() < 0.9
-    found = [e for e in decode(damaged.tobytes(), REPORTS, [333] * (len(damaged) // 333)) if isinstance(e, m.Message)]
+    found = [e for e in decode(damaged.tobytes(), m.REPORTS, [333] * (len(damaged) // 333)) if isinstance(e, m.Message)]
     intact = [message for message, bad in zip(sent, touched, strict=True) if not bad]
     # The intact ones are all decoded, in their order ...
     place = -1
@@ -366,7 +360,7 @@ def test_one_percent_of_damaged_bytes(seed):
 
 
 def test_random_bytes_make_no_message():
-    decoder = Decoder(REPORTS)
+    decoder = Decoder(m.REPORTS)
     events = decoder.feed(np.random.default_rng(7).bytes(200_000)) + decoder.finish()
     assert {type(event) for event in events} == {m.Skipped}
     assert (decoder.messages, decoder.skipped_bytes) == (0, 200_000)
@@ -375,30 +369,30 @@ def test_random_bytes_make_no_message():
 # A registered message: declared once, then written and read like those of the boards.
 
 
-@message(b"R42")
-class Weather(Message):
+@m.message(b"R42")
+class Weather(m.Message):
     """R42: weather at a board."""
 
-    board: int = wire(ID)
-    place: str = wire(TEXT)
-    celsius: float = wire(PRINTED)
-    raw: bytes = wire(BYTES)
-    wet: bool = wire(BOOL, default=False)
+    board: int = m.wire(ID)
+    place: str = m.wire(TEXT)
+    celsius: float = m.wire(PRINTED)
+    raw: bytes = m.wire(BYTES)
+    wet: bool = m.wire(BOOL, default=False)
 
 
-@message(b"C42")
-class GetWeather(Message):
+@m.message(b"C42")
+class GetWeather(m.Message):
     """C42: ask for the weather above a height."""
 
-    height_m: float = wire(RAW_FLOAT)
+    height_m: float = m.wire(RAW_FLOAT)
 
 
 @pytest.fixture(autouse=True)
 def registered():
-    register_message(Weather)
-    register_message(GetWeather)
+    m.register_message(Weather)
+    m.register_message(GetWeather)
     yield
-    del REPORTS[b"R42"], COMMANDS[b"C42"]
+    del m.REPORTS[b"R42"], m.COMMANDS[b"C42"]
 
 
 SAMPLE = Weather(7, "roof", -3.5, b"|\r\nR05|", wet=True)
@@ -406,15 +400,19 @@ LINE = b"R42|7|roof|-3.5000|\x07\x00|\r\nR05||1\r\n"
 
 
 def test_registered_messages_are_written_and_read():
-    assert (encode(SAMPLE), decode(LINE, REPORTS), decode(LINE, REPORTS, [1] * len(LINE))) == (LINE, [SAMPLE], [SAMPLE])
-    assert decode(b"R00\r\n" + LINE + b"R01|5\r\n", REPORTS)[1] == SAMPLE
-    assert decode(encode(GetWeather(1.5)), COMMANDS) == [GetWeather(1.5)]
+    assert (encode(SAMPLE), decode(LINE, m.REPORTS), decode(LINE, m.REPORTS, [1] * len(LINE))) == (
+        LINE,
+        [SAMPLE],
+        [SAMPLE],
+    )
+    assert decode(b"R00\r\n" + LINE + b"R01|5\r\n", m.REPORTS)[1] == SAMPLE
+    assert decode(encode(GetWeather(1.5)), m.COMMANDS) == [GetWeather(1.5)]
 
 
 def test_damage_is_a_counted_skip():
     for damaged in (LINE.replace(b"-3.5000", b"-3.5"), LINE.replace(b"R42|7|", b"R42|256|"), LINE[:-1] + b"x"):
-        events = decode(damaged + LINE, REPORTS, [len(damaged)])
-        assert (events[-1], b"".join(e.data for e in events if isinstance(e, Skipped))) == (SAMPLE, damaged)
+        events = decode(damaged + LINE, m.REPORTS, [len(damaged)])
+        assert (events[-1], b"".join(e.data for e in events if isinstance(e, m.Skipped))) == (SAMPLE, damaged)
 
 
 def test_fields_are_declared_once_and_frozen():
@@ -426,39 +424,39 @@ def test_fields_are_declared_once_and_frozen():
         encode(Weather(300, "x", 0.0, b""))
 
 
-@pytest.mark.parametrize("key", [b"X01", b"R1", b"R123", "R42", None])
-def test_keys_are_a_letter_and_two_digits(key):
-    with pytest.raises(ArgumentError, match=r"key: found .*, expected a letter C, R or S and two digits"):
-        message(key)
-
-
-@message(b"R43")
-class Half(Message):
+@m.message(b"R43")
+class Half(m.Message):
     """One field has no kind."""
 
-    board: int = wire(ID)
+    board: int = m.wire(ID)
     rest: int = 0
 
 
-@message(b"R05")
-class Another(Message):
+@m.message(b"R05")
+class Another(m.Message):
     """A key of the boards."""
 
-    count: int = wire(INT)
+    count: int = m.wire(INT)
 
 
 @pytest.mark.parametrize(
-    ("kind", "expected"),
+    ("make", "given", "expected"),
     [
-        (Weather, r"message Weather \(R42\): R42 is Weather already; choose another key"),
-        (Another, r"message Another \(R05\): R05 is RangeReport already"),
-        (Half, r"message Half \(R43\): rest: has no kind; declare it as in `count: int = wire\(INT\)`"),
-        (Message, "expected a class made with @message"),
-        (int, "expected a class made with @message"),
-        (SAMPLE, "expected a class made with @message"),
+        *(
+            (m.message, key, "key: found .*, expected a letter C, R or S and two digits")
+            for key in (b"X01", b"R1", b"R123", "R42", None)
+        ),
+        (m.register_message, Weather, r"message Weather \(R42\): R42 is Weather already; choose another key"),
+        (m.register_message, Another, r"message Another \(R05\): R05 is RangeReport already"),
+        (
+            m.register_message,
+            Half,
+            r"message Half \(R43\): rest: has no kind; declare it as in `count: int = wire\(INT\)`",
+        ),
+        *((m.register_message, other, "expected a class made with @message") for other in (m.Message, int, SAMPLE)),
     ],
 )
-def test_wrong_messages_are_refused(kind, expected):
+def test_wrong_keys_and_messages_are_refused(make, given, expected):
     with pytest.raises(ArgumentError, match=expected):
-        register_message(kind)
-    assert REPORTS[b"R05"] is RangeReport
+        make(given)
+    assert m.REPORTS[b"R05"] is m.RangeReport

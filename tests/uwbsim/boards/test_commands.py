@@ -50,9 +50,13 @@ def voltage():
     EXECUTORS.pop(b"C10", None)
 
 
-def test_a_new_command_is_one_message_class_and_one_executor(voltage):
+@pytest.fixture
+def ports():
+    return uwbsim.VirtualPorts(bench_scenario())
+
+
+def test_a_new_command_is_one_message_class_and_one_executor(voltage, ports):
     register_command(GetVoltage, lambda board, factor, name: Voltage(board.id, 3.25 * factor, name.decode()))
-    ports = uwbsim.VirtualPorts(bench_scenario())
     assert Board(ports.port(2)).request(GetVoltage(2, "core")) == Voltage(2, 6.5, "core")
     assert Board(ports.port(1)).request(m.GetId()) == m.IdReport(1)
     assert ports.transfers.maxlen == 20_000, "what boards sent long ago is not kept"
@@ -124,8 +128,7 @@ def test_differences_from_the_firmware_are_those_on_the_page(data, kinds, alive)
 
 
 @pytest.mark.parametrize("text", ["a\0b", "a|b", "a\rb"])
-def test_the_driver_writes_no_text_that_boards_read_otherwise(text):
-    ports = uwbsim.VirtualPorts(bench_scenario())
+def test_the_driver_writes_no_text_that_boards_read_otherwise(text, ports):
     with pytest.raises(RefusedError, match="text"):
         Board(ports.port(1)).request(m.DoTests(1, text, True, 1.0, b"\0\r|"))
     assert not ports.transfers
@@ -158,8 +161,7 @@ def test_nan_and_infinity_are_printed_like_the_processor(value, printed):
 
 
 @pytest.mark.parametrize("raw", [b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", b"\x00\x00\x80\xff", b"\xff\xff\x7f\x7f"])
-def test_nan_does_not_stop_the_bench(raw):
-    ports = uwbsim.VirtualPorts(bench_scenario())
+def test_nan_does_not_stop_the_bench(raw, ports):
     ports.bench.boards[1].write(b"C03|1|a|1|" + raw + b"|\x01\x00x\r")
     ports.bench.advance(5 * NS_PER_MS)
     assert ports.transfers[0][2].startswith(b"R03|0|1|a|1|")

@@ -15,7 +15,6 @@ from tests.browser import lies_well
 from tests.shared_data import ROOT
 from uwblink import PROTOCOLS
 from uwblink.pages import figures
-from uwblink.pages.figures import picture, style
 from uwblink.ticks import METRES_PER_TICK
 from uwbsim.pages import write_sweep_page
 from uwbsim.pages.figures import error_over, histograms, result_over_keys, room, timing
@@ -27,13 +26,13 @@ NLOS_OFFICE = SCENARIOS / "nlos_office/office.toml"
 
 
 def words(draw):
-    return re.findall(r"<text[^>]*>([^<]*)</text>", picture(draw, "svg").decode())
+    return re.findall(r"<text[^>]*>([^<]*)</text>", figures.picture(draw, "svg").decode())
 
 
 @pytest.mark.parametrize("width", [3.5, 7.16])
 def test_a_room_is_to_scale_within_its_walls(width):
     scenario = uwbsim.load(OFFICE)
-    with style():
+    with figures.style():
         figure = room(width, scenario)
         figure.draw_without_rendering()
     low, high = np.array(scenario.room.min_m), np.array(scenario.room.max_m)
@@ -52,7 +51,7 @@ def test_a_room_is_to_scale_within_its_walls(width):
 @pytest.mark.parametrize("width", [3.5, 7.16])
 @pytest.mark.parametrize("name", ["ss", "ds", "ds-alt", "ds-sym"])
 def test_words_of_a_timing_diagram_do_not_cover_each_other(width, name):
-    with style():
+    with figures.style():
         figure = timing(width, uwbsim.load(BENCH), name)
         figure.draw_without_rendering()
         boxes = [(t.get_text(), t.get_window_extent()) for t in figure.axes[0].texts if t.get_text()]
@@ -194,7 +193,7 @@ def test_words_and_many_keys_are_drawn_key_by_key():
 def test_numbers_along_an_axis_do_not_cover_each_other(x):
     flat = np.ones(12)
     curve = ErrorCurve(x=x, bias_m=flat, std_m=flat, predicted_bias_m=flat, predicted_std_m=flat)
-    with style():
+    with figures.style():
         figure = error_over(7.16, {"ss": curve}, "first-path power (dBm)")
         figure.draw_without_rendering()
         boxes = [[t.get_window_extent() for t in axes.get_xticklabels()] for axes in figure.axes]

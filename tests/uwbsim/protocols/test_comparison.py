@@ -11,7 +11,6 @@ from tests.shared_data import ROOT
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT, raw_range
 from uwblink.pages import figures
 from uwblink.ticks import TICK_S, elapsed
-from uwbsim import load, simulate
 from uwbsim.protocols.comparison import compare, costs, optimum, over_reply, over_skew
 from uwbsim.protocols.conditions import calibrated, conditions_of, range_errors_m
 from uwbsim.protocols.prediction import broadcast_variances_m2, predict
@@ -23,7 +22,7 @@ ROWS = list(PROTOCOLS.values())
 
 @pytest.fixture(scope="module")
 def scenario():
-    return load(TEST1)
+    return uwbsim.load(TEST1)
 
 
 def test_predictions_agree_with_simulations(scenario):
@@ -98,10 +97,10 @@ def test_a_bias_does_not_average_away(scenario, name):
 @pytest.mark.parametrize("name", ["ss", "ds", "ds-sym"])
 def test_compare_counts_as_many_exchanges_a_second_as_a_run_has(name):
     settings = ["run.duration_s=4", f"ranging.protocol={name}"]
-    calm = load(TEST1, settings)
+    calm = uwbsim.load(TEST1, settings)
     fastest = calm.ranging.fastest_hz(calm.radio.preamble_symbols)
-    crowded = load(TEST1, [*settings, f"ranging.rate_hz={0.999 * fastest}"])
-    time_ns = simulate(crowded).exchanges.time_ns
+    crowded = uwbsim.load(TEST1, [*settings, f"ranging.rate_hz={0.999 * fastest}"])
+    time_ns = uwbsim.simulate(crowded).exchanges.time_ns
     said = compare(crowded, [name], 1000).outcomes[0].rate_hz
     assert said == pytest.approx(fastest, rel=1e-9)
     # Immediate replies take 4 us longer on average than in the median, and a second has whole exchanges.
@@ -139,8 +138,8 @@ def fleet_world(white_ppm_sqrt_s, duration_s):
             for k in places
         ],
     }
-    fastest = load(world).ranging.fastest_hz(128, len(PLACES))
-    return load(world, {"ranging.rate_hz": 0.9999 * fastest})
+    fastest = uwbsim.load(world).ranging.fastest_hz(128, len(PLACES))
+    return uwbsim.load(world, {"ranging.rate_hz": 0.9999 * fastest})
 
 
 def differences_m(heard):
@@ -165,7 +164,7 @@ def test_broadcasts_and_differences_err_as_predicted(white, seconds, part):
     %.
     """
     scenario = fleet_world(white, seconds)
-    flight = simulate(scenario)
+    flight = uwbsim.simulate(scenario)
     found = {one.method: one for one in uwbsim.compare(scenario, ["ds"], 1).fleet}
     assert list(found) == ["ds", "broadcast", "tdoa"]
     assert np.std(raw_range(flight.exchanges) - flight.truth_m) == pytest.approx(found["broadcast"].std_m, rel=part)

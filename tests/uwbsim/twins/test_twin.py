@@ -142,24 +142,6 @@ def test_the_command_writes_a_scenario_and_a_page(tmp_path):
     assert uwbsim.load(tmp_path / "t.toml").run.name == "twin of f"
 
 
-WRONG = {
-    "poses": (lambda f: replace(f, poses=Poses.from_arrays([], "", (0.0, 0.0, 0.0))), "holds no poses"),
-    "powers": (
-        lambda f: replace(f, exchanges=replace(f.exchanges, fpp1_dbm=np.full(len(f.exchanges), np.nan))),
-        "no exchange has both first-path powers",
-    ),
-    "length": (lambda f: replace(f, exchanges=f.exchanges[:99]), "99 exchanges, but a twin needs 100 or more"),
-    "tags": (lambda f: replace(f, tags=f.tags[:2]), "no body of tag 13"),
-}
-
-
-@pytest.mark.parametrize("what", WRONG)
-def test_recordings_without_a_twin(flight, what):
-    change, message = WRONG[what]
-    with pytest.raises(uwbsim.ScenarioError, match=message):
-        uwbsim.twin(change(flight), known(world()))
-
-
 CURVE = known(world())["bias_curve"]
 
 
@@ -177,26 +159,42 @@ def test_the_scenario_has_the_curve_of_the_calibration_at_any_level_of_lifting(f
 
 
 @pytest.mark.parametrize(
-    ("change", "place"),
+    ("of_flight", "of_calibration", "message"),
     [
-        ({"delays_ns": {"11": 0.0}, "delays_std_ns": {"11": 0.0}}, "tag 12, 13"),
-        ({"delays_ns": {"x": 0.0}}, "delays_ns"),
-        ({"delays_ns": {"11": None}}, "delays_ns: 11"),
+        (lambda f: {"poses": Poses.from_arrays([], "", (0.0, 0.0, 0.0))}, {}, "holds no poses"),
         (
-            {"schema_version": 2, "groups": {"a": {"tags": [11, 12, 13], "bias_curve": CURVE, "sigma_curve": CURVE}}},
-            "groups",
+            lambda f: {"exchanges": replace(f.exchanges, fpp1_dbm=np.full(len(f.exchanges), np.nan))},
+            {},
+            "no exchange has both first-path powers",
         ),
-        ({"schema_version": 4, "pair_offsets": {"11-12": {"offset_m": 0.1, "std_m": 0.0}}}, "pair_offsets"),
-        ({"schema_version": 9}, "9"),
-        ({"lift": "none"}, "lift"),
-        ({"alpha_dbm": "x"}, "alpha_dbm"),
-        ({"speed_of_light": 1.0}, "speed_of_light"),
-        ({"bias_curve": {"knots": [0, 1], "coefficients": [0], "degree": 3, "range": [0, 1]}}, "bias_curve"),
+        (lambda f: {"exchanges": f.exchanges[:99]}, {}, "99 exchanges, but a twin needs 100 or more"),
+        (lambda f: {"tags": f.tags[:2]}, {}, "no body of tag 13"),
+        *(
+            (lambda f: {}, change, f"^calibration: .*{place}")
+            for change, place in (
+                ({"delays_ns": {"11": 0.0}, "delays_std_ns": {"11": 0.0}}, "tag 12, 13"),
+                ({"delays_ns": {"x": 0.0}}, "delays_ns"),
+                ({"delays_ns": {"11": None}}, "delays_ns: 11"),
+                (
+                    {
+                        "schema_version": 2,
+                        "groups": {"a": {"tags": [11, 12, 13], "bias_curve": CURVE, "sigma_curve": CURVE}},
+                    },
+                    "groups",
+                ),
+                ({"schema_version": 4, "pair_offsets": {"11-12": {"offset_m": 0.1, "std_m": 0.0}}}, "pair_offsets"),
+                ({"schema_version": 9}, "9"),
+                ({"lift": "none"}, "lift"),
+                ({"alpha_dbm": "x"}, "alpha_dbm"),
+                ({"speed_of_light": 1.0}, "speed_of_light"),
+                ({"bias_curve": {"knots": [0, 1], "coefficients": [0], "degree": 3, "range": [0, 1]}}, "bias_curve"),
+            )
+        ),
     ],
 )
-def test_calibrations_without_a_twin_are_refused_by_place(flight, change, place):
-    with pytest.raises(uwbsim.ScenarioError, match=f"^calibration: .*{place}"):
-        uwbsim.twin(flight, known(world()) | change)
+def test_recordings_and_calibrations_without_a_twin_are_refused(flight, of_flight, of_calibration, message):
+    with pytest.raises(uwbsim.ScenarioError, match=message):
+        uwbsim.twin(replace(flight, **of_flight(flight)), known(world()) | of_calibration)
 
 
 def test_a_terminal_of_80_columns_loses_no_figure(compared, capsys, monkeypatch):
