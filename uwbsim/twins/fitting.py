@@ -237,7 +237,7 @@ class Twin:
         path, table = Path(output), dict(self.table)
         check_name(path)
         for file in self.files(path):
-            check_output(file, force=force)
+            check_output(file, force=force, recording=file != path and file.suffix == ".uwb")
         if self.paths:
             poses = path.with_suffix(".poses.uwb")
             with Recording.create(poses, meta={"source": "uwbsim twin"}, force=force) as recording:
