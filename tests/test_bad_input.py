@@ -55,6 +55,7 @@ def seeds(tmp_path_factory):
     (folder / "t.csv.gz").write_bytes(broken[:40] + broken[60:80] * 100 + broken[40:])
     (folder / "r.csv").write_text("time_s,from_id,to_id,range_m\n0.0,1,2,3.0\n")
     (folder / "log.toml").write_text('line = "{range_m} m"\n[constants]\nfrom_id = 1\nto_id = 2\n')
+    (folder / "zeros.csv").write_bytes(bytes(3000))
     (folder / "wide.csv").write_text((folder / "r.csv").read_text(), "utf-16")
     (folder / f"{NO_UTF8}.uwb").write_bytes(whole)
     (folder / f"{NO_UTF8}.csv").write_text((folder / "r.csv").read_text())
@@ -154,10 +155,13 @@ WORDS = [
     ("calib export {c_json} --to csv -o no/out.csv", ["no"]),
     ("uwblink import csv {t_csv_gz} -o o.uwb", ["t.csv.gz", "gzip"]),
     ("uwblink import csv {f_uwb} -o o.uwb", ["f.uwb", "not a text file"]),
-    # A file or folder that is no recording would not open as one.
+    ("uwblink poses {f_uwb} --from {zeros_csv}", ["zeros.csv", "not a text file"]),
+    ("uwblink poses {f_uwb} --from {wide_csv}", ["wide.csv", "UTF-16", "UTF-8"]),
+    # Only recordings have this ending.
     ("uwblink import guess {r_csv} -o o.uwb", ["o.uwb", ".uwb is the ending of recordings"]),
     ("calib fit {f_uwb} -o o.uwb", ["o.uwb", ".uwb is the ending of recordings"]),
     ("calib apply {f_uwb} -c {c_json} --to csv -o o.uwb", ["o.uwb", ".uwb is the ending of recordings"]),
+    ("calib localize {f_uwb} -c {c_json} --tum o.uwb", ["o.uwb", ".uwb is the ending of recordings"]),
     ("uwbsim compare noiseless -o o.uwb", ["o.uwb", ".uwb is the ending of recordings"]),
     # A recording that is given twice, also under another name, would count as twice the evidence.
     ("calib fit {f_uwb} {f_uwb} -o o.json", ["f.uwb"]),
@@ -245,12 +249,13 @@ WORDS = [
 TAGS = "[[tags]]\nid = 1\nbody = 'robot1'\n"
 TAGS_LINE = "uwblink poses {f_uwb} --from {poses_csv} --tags own.toml"
 OWN = [
-    # Nested too deeply.
+    # As a constant, the name of a column would be the id of a tag in all rows.
     (
         "uwblink import csv {r_csv} --map own.toml -o o.uwb",
         ["r.csv", "constants.from_id", "'to_id'", "[columns]"],
         '[constants]\nfrom_id = "to_id"\n',
     ),
+    # Nested too deeply.
     *((line, ["own.toml"], DEEP) for line in (
         "uwbsim validate own.toml",
         "uwbsim sweep own.toml -o o",

@@ -134,8 +134,9 @@ def new_file(path: Path) -> TextIO:
 def made_folder(folder: Path) -> Iterator[None]:
     """Create a folder and missing parents; if the block fails, the new folders are removed again if they are empty.
 
-    Raises `OutputError` if a folder cannot be created.
+    Raises `OutputError` if a folder cannot be created or has the suffix of recordings.
     """
+    check_ending(folder)
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         with raising(OutputError, f"{folder}: cannot be made"):
@@ -212,7 +213,9 @@ def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
 def check_ending(path: Path) -> None:
     """Raise `OutputError` if an output that is not a recording has the suffix of recordings."""
     if path.suffix.lower() == ".uwb":
-        raise OutputError(f"{path}: .uwb is the ending of recordings, and this output is none; give another name")
+        raise OutputError(
+            f"{path}: .uwb is the ending of recordings, but this output is not a recording; give another name"
+        )
 
 
 def check_folder(path: Path, names: Iterable[str] = (), *, force: bool = False) -> None:

@@ -213,7 +213,8 @@ class Search:
     def fit_likelihood(self) -> None:
         """Maximise the restricted likelihood of direct, reflected and outlying ranges in all unknowns at once.
 
-        Motion and errors in turn can end in a local maximum: errors that fit a wrong motion keep it wrong.
+        Estimating motion and errors alternately can end in a local maximum, because errors that fit a wrong motion
+        keep the motion wrong.
         """
         mixture, unknowns, parts = self.model.error_model(self.residuals())
         if self.free_ranges < MIN_RANGES_PER_PAIR * len(self.model.pairs.ends):

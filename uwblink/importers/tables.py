@@ -66,6 +66,13 @@ def _refuse_utf16(path: Path, raw: bytes) -> None:
         raise ImportTableError(f"{path}: is text in UTF-16; save it in UTF-8")
 
 
+def check_text(path: Path, raw: bytes) -> None:
+    """Raise `ImportTableError` if the first bytes of a table are not text in UTF-8, but UTF-16 or binary."""
+    _refuse_utf16(path, raw)
+    if b"\0" in raw:
+        raise ImportTableError(f"{path}: not a text file (it contains zero bytes); expected a table in UTF-8")
+
+
 def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, bool, int]:
     """Return the dialect of a CSV file by its first 64 KiB, for parts that the map does not state.
 
@@ -76,9 +83,7 @@ def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, boo
     delimiter, decimal = column_map.delimiter, column_map.decimal
     with reading(path), open_file(path) as file:
         raw = file.read(65_536)
-        _refuse_utf16(path, raw)
-        if b"\0" in raw:
-            raise ImportTableError(f"{path}: not a text file (it contains bytes of zero), expected a table in UTF-8")
+        check_text(path, raw)
         # A letter of several bytes may be cut at the end of the read bytes.
         lines = raw.decode("utf-8-sig", errors="strict" if len(raw) < 65_536 else "ignore").splitlines()
         first = next((k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))

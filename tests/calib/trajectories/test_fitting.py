@@ -141,11 +141,11 @@ def test_noise_accounts_for_the_unknowns_of_paths():
 
 
 @pytest.mark.slow
-def test_the_fit_finds_the_greatest_of_several_maxima_of_the_likelihood():
-    """Fitting motion and errors alternately ends in another maximum, with delays that are wrong by 147 ps."""
+def test_the_fit_does_not_stop_at_a_lower_maximum_of_the_likelihood():
+    """Estimating motion and errors alternately ends in one, with delays that are wrong by 147 ps (rms)."""
     flown = scenario("lasting_reflections/hall.toml", 8, 40.0)
     known = calib.fit_from_ranges(flown, poses_until_s=10.0).calibration
     error_ns = [known.delays_ns[tag] - flown.planted["delays_ns"][str(tag)] for tag in known.delays_ns]
-    # Twice the standard error, 30 ps; the delays have a common constant.
+    # The limit is twice the standard error of 30 ps. The delays have a common constant, which is removed.
     assert np.std(error_ns) < 0.06
     assert max(known.delays_std_ns.values()) < 0.1
