@@ -215,7 +215,7 @@ class Ranges(ColumnTable):
         and `elevation_deg` are the directions from the antennas of initiator and target to each other, in the frames of
         their bodies, needed only by patterns over direction. `temperature_c` are the temperatures of initiator and
         target, `features` some of `FEATURES` by name. Raises `BadInputError` if the arrays do not have equal lengths,
-        for a tag at both ends, impossible temperatures, and unknown protocols and features.
+        for a tag at both ends, positive powers, impossible temperatures, and unknown protocols and features.
 
         >>> from calib import Ranges
         >>> len(Ranges.from_arrays([3.1, 4.2], initiator=1, target=[2, 3], fpp1_dbm=-85.0))
@@ -257,7 +257,11 @@ class Ranges(ColumnTable):
         if itself.any():
             row = int(np.argmax(itself))
             raise BadInputError(f"row {row} has tag {columns['target'][row]} at both ends", parameter="target")
-        columns |= {name: measured_powers(columns[name]) for name in ("fpp1_dbm", "fpp2_dbm")}
+        for name in ("fpp1_dbm", "fpp2_dbm"):
+            if len(positive := columns[name][columns[name] > 0]):
+                what = "expected powers in dBm, which are below 0; NaN or 0 stands for an unknown power"
+                raise BadInputError(f"found {positive[0]:g}, {what}", parameter=name)
+            columns[name] = measured_powers(columns[name])
         warm, around, up = (np.array([columns.pop(f"{name} {end}") for end in (0, 1)]).T for name in both)
         columns["temperature_c"], around, up = measured_c(warm), np.radians(around), np.radians(up)
         if len(wrong := warm[~np.isnan(warm) & np.isnan(columns["temperature_c"])]):

@@ -156,6 +156,9 @@ def test_arrays_become_ranges():
         ({"protocol": "zz"}, "protocol", "`protocol`: found 'zz'"),
         ({"target": [2, 1]}, "target", "`target`: row 1 has tag 1 at both ends"),
         ({"weights": (0.5,)}, "weights", "`weights`: found 1"),
+        # A lost sign would leave the range without a power, and so without its bias and sigma.
+        ({"fpp1_dbm": [-85.0, 85.0]}, "fpp1_dbm", "`fpp1_dbm`: found 85"),
+        ({"fpp2_dbm": 84}, "fpp2_dbm", "`fpp2_dbm`: found 84"),
     ],
 )
 def test_arrays_that_do_not_fit_are_refused_by_column(wrong, parameter, said):
