@@ -80,7 +80,8 @@ def _warnings(results: Results) -> list[Block]:
         if results.part is not None
         else "",
         *(
-            f"{name}: {one.fault}. {capitalized(one.evidence)}. {capitalized(one.remedy)}."
+            # A remedy may end with lines of a file, which no full stop may follow.
+            f"{name}: {one.fault}. {capitalized(one.evidence)}. {capitalized(one.remedy)}"
             for name, one in results.findings
         ),
     ]

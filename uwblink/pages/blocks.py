@@ -62,8 +62,8 @@ def inline(svg: bytes, caption: str) -> str:
 
 
 def prose(text: str) -> str:
-    """Return a text as HTML, with names in backticks as code."""
-    return re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))
+    """Return a text as HTML, with its lines, and names in backticks as code."""
+    return re.sub("`([^`]+)`", r"<code>\1</code>", escape(text)).replace("\n", "<br/>")
 
 
 def table_html(

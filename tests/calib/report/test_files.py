@@ -19,7 +19,7 @@ from tests import pages
 from tests.processes import refuse, succeed
 from uwblink import Contents, Recording, UwblinkError
 from uwblink.pages import figures
-from uwblink.pages.blocks import Document, write_document
+from uwblink.pages.blocks import Document, to_html, write_document
 from uwblink.pages.pdf import to_pdf
 
 FORMS = {f"{width}.{kind}" for width in ("column", "page") for kind in ("pdf", "svg")}
@@ -278,6 +278,12 @@ def test_planned_flights_have_figures_of_path_intervals_and_gains(tmp_path):
 def paper(*blocks):
     read = PdfReader(io.BytesIO(to_pdf(Document("A report", list(blocks)), {})))
     return [page.extract_text() for page in read.pages]
+
+
+def test_lines_of_a_remedy_stay_lines():
+    remedy = Text("The ranges give\n[[tags]]\nid = 2", "warning")
+    assert "The ranges give<br/>[[tags]]<br/>id = 2" in to_html(Document("", [remedy]))
+    assert "The ranges give\n[[tags]]\nid = 2" in paper(remedy)[0]
 
 
 def table(rows, above=()):
