@@ -170,6 +170,12 @@ def turned_arm(flight: Flight, rng: np.random.Generator) -> Flight:
     return arms(flight, lambda tag: tuple(-v for v in tag.lever_arm_m) if tag.tag == mine else tag.lever_arm_m)
 
 
+def missing_arm(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Leave out one lever arm."""
+    mine = tag_of(flight, rng)
+    return arms(flight, lambda tag: (0.0, 0.0, 0.0) if tag.tag == mine else tag.lever_arm_m)
+
+
 def other_origin(flight: Flight, rng: np.random.Generator) -> Flight:
     """Write the poses of a body relative to another origin, 0.4 to 0.8 m away."""
     mine, way = flight.poses.body == f"drone{rng.integers(1, 4)}", rng.uniform(0, 2 * np.pi)
@@ -445,6 +451,7 @@ FAULTS: Final = (
     Case("attitudes of a body turned about its vertical", BASE, partial(turned_attitudes, body="drone2"),
          names("attitudes in another frame")),
     Case("of a tag, with the wrong sign", BASE, turned_arm, names("wrong lever arm")),
+    Case("of a tag, left out", BASE, missing_arm, names("wrong lever arm")),
     Case("its poses 0.4 to 0.8 m off", BASE, other_origin, names("body stands elsewhere")),
     Case("one in two seconds", BASE, rare_poses, names("rare poses")),
     Case("poses of a body repeat for 1 to 6 s", BASE, partial(frozen_poses, bodies=1), names("frozen poses")),
@@ -553,7 +560,7 @@ def lines_of(found: list[tuple[int, int, Counter[str]]]) -> str:
         named.setdefault(" or ".join(sorted(case.expected)), []).append(case.name)
     return "\n".join([
         f"Sound recordings: {alarms} of {runs} with a false alarm ({100 * alarms / runs:.1f} %). Planted faults: "
-        f"{hits} of {planted} found ({100 * hits / planted:.0f} %), {beside} with an additional false finding. "
+        f"{hits} of {planted} found ({100 * hits / planted:.1f} %), {beside} with an additional false finding. "
         f"Not as expected: {'; '.join(told) or 'none'}.",
         "", "| finding | planted |", "|---|---|",
         *(f"| {fault} | {'; '.join(names)} |" for fault, names in named.items()),

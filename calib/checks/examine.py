@@ -290,8 +290,8 @@ CHECKS: Final = (
         f"{OVER_STRETCHES}; binomial, for all tags or pairs",
         {
             "reflections": "{more}",
-            "reflections that last": "such errors do not average out while a reflection lasts: record for longer, or "
-            "move walls, bodies or antennas",
+            "reflections that last": "with motion capture, check the lever arms, because wrong ones look alike; "
+            "reflections do not average out while they last: record for longer, or move walls, bodies or antennas",
         },
         residuals.reflections,
     ),

@@ -159,6 +159,7 @@ UNREAD = "single-sided without carrier readings"
         (SHORT, planted.wxyz, "wxyz quaternion", ""),
         (SHORT, planted.inverse_attitudes, "inverse quaternion", "signs of x y z"),
         (SHORT, planted.turned_arm, "wrong lever arm", "lever_arm_m"),
+        (SHORT, planted.missing_arm, "wrong lever arm", "lever_arm_m"),
         (SHORT, turned_with_gaps, "attitudes in another frame", "from the left"),
         (SHORT, partial(planted.turned_attitudes, body="drone2"), "attitudes in another frame", "lever_arm_m"),
         (replace(SHORT, seconds=120), planted.other_origin, "body stands elsewhere", r"0\.7\d m away \(-0\.0\d, -0\.7"),
