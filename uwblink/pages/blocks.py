@@ -62,7 +62,7 @@ def inline(svg: bytes, caption: str) -> str:
 
 
 def prose(text: str) -> str:
-    """Return a text as HTML, with its lines, and names in backticks as code."""
+    """Return a text as HTML, with its line breaks, and with names in backticks as code."""
     return re.sub("`([^`]+)`", r"<code>\1</code>", escape(text)).replace("\n", "<br/>")
 
 
