@@ -23,6 +23,7 @@ from uwblink.importers.column_map import (
     ALL_IDS,
     DISTANCES,
     IDS,
+    NAMES,
     POSITIONS,
     POWERS,
     SIGN,
@@ -31,6 +32,7 @@ from uwblink.importers.column_map import (
     ColumnMap,
     load_map,
 )
+from uwblink.importers.forms import NOT_READ, named_columns
 from uwblink.importers.plausibility import (
     MIN_ROWS,
     ROW_PERIOD_NS,
@@ -228,6 +230,7 @@ def _usable(staging: Staging) -> tuple[StagedRows, Reading | None]:
         rows = faults.reject(staging.rows, SOUND_IDS)
     if layout not in ("exchanges", "ranges", "parts") and any(map(staging.rows.has, TEMPERATURES)):
         notes.append(f"temperatures are only read if a row is an exchange, not with layout {layout}")
+    notes += _unread_columns(staging, layout)
     total = rows.count() + len(faults)
     staging.watch("checking", 0.0)
     value = {"ranges": "range_m", "differences": "difference_m"}.get(layout)
@@ -265,6 +268,20 @@ def _usable(staging: Staging) -> tuple[StagedRows, Reading | None]:
     notes += filter(None, [note])
     check_units(column_map, path, sample, raw_range(exchanges_of(column_map, sample, reading)))
     return in_time_order(rows), reading
+
+
+def _unread_columns(staging: Staging, layout: str) -> Iterator[str]:
+    """Yield a note on columns that are not read, if no map names columns and their names resemble those of a map."""
+    foreign = NOT_READ.get(layout, NOT_READ["exchanges"])
+    read = set(NAMES) - set(foreign)
+    found = {
+        header: name
+        for name, header in named_columns(staging.tables[0].names).items()
+        if not (header in read or name in foreign or staging.rows.has(name))
+    }
+    if found and not staging.column_map.columns:
+        named = first_few((f"{header!r:.60} ({name}?)" for header, name in found.items()), 6)
+        yield f"these columns are not read: {named}; name them in a map, which `uwblink import guess` proposes"
 
 
 def _layout(staging: Staging) -> str:

@@ -23,6 +23,7 @@ from uwblink.importers.column_map import (
     JSON_LINE,
     POSITIONS,
     POWERS,
+    TEMPERATURES,
     TIME_UNITS,
     UNITS_BY_KEY,
     ColumnMap,
@@ -31,8 +32,20 @@ from uwblink.importers.devices import LINES
 from uwblink.importers.plausibility import MIN_ROWS, reason_against_dbm, reason_against_metres
 from uwblink.importers.tables import detect, lacks_header, object_in, open_file, reading
 from uwblink.importers.templates import Template
+from uwblink.twr import STAMPS
 
 OF_MESSAGES: Final = ("tx", "rx", "fpp", "rxp", "skew", "sts", "sequence", "message")
+OF_EXCHANGES: Final = (*STAMPS, "fpp1", "fpp2", "rxp1", "rxp2", "skew1", "skew2", "sts1", "sts2", *TEMPERATURES)
+
+NOT_READ: Final = {
+    "exchanges": OF_MESSAGES,
+    "broadcasts": (*OF_EXCHANGES, "fpp", "rxp", "skew", "sts"),
+    "messages": OF_EXCHANGES,
+    "stamps": OF_EXCHANGES,
+    "ranges": (*OF_MESSAGES, *STAMPS),
+    "differences": (*OF_MESSAGES, *TEMPERATURES, *STAMPS, "range_m"),
+}
+"""The columns that are not read, by layout."""
 
 WORDS: Final = {
     "end": (

@@ -38,11 +38,11 @@ from uwblink.importers.column_map import (
     POWERS,
     SIGN,
     STAMP_UNITS,
-    TEMPERATURES,
     ColumnMap,
 )
 from uwblink.importers.exchange_tables import tables_in
 from uwblink.importers.forms import (
+    NOT_READ,
     OF_MESSAGES,
     WORDS,
     Entries,
@@ -132,26 +132,16 @@ def _receptions(short: Mapping[str, str], each: str, found: Mapping[str, str]) -
     return columns if columns.keys() == wanted.keys() else {}
 
 
-_OF_EXCHANGES: Final = (*STAMPS, "fpp1", "fpp2", "rxp1", "rxp2", "skew1", "skew2", "sts1", "sts2", *TEMPERATURES)
-
 _LAYOUTS: Final = {
-    "exchanges": (STAMPS[:4], OF_MESSAGES, "a row has the stamps of a whole exchange"),
-    "broadcasts": (
-        ("tx", "rx", "sequence", "heard"),
-        (*_OF_EXCHANGES, "fpp", "rxp", "skew", "sts"),
-        "broadcasts have lists of what their senders heard",
-    ),
-    "messages": (("tx", "rx"), _OF_EXCHANGES, "a row has one stamp of a sender and one of a receiver"),
-    "stamps": (("message",), _OF_EXCHANGES, "a row has one stamp, and a word for transmission or reception"),
-    "ranges": (("range_m",), (*OF_MESSAGES, *STAMPS), "there are ranges and no stamps"),
-    "differences": (
-        ("difference_m",),
-        (*OF_MESSAGES, *TEMPERATURES, *STAMPS, "range_m"),
-        f"{SIGN}: exchange the two if it is not",
-    ),
-    "nothing": ((), OF_MESSAGES, "neither stamps nor ranges were recognised: name their columns below"),
+    "exchanges": (STAMPS[:4], "a row has the stamps of a whole exchange"),
+    "broadcasts": (("tx", "rx", "sequence", "heard"), "broadcasts have lists of what their senders heard"),
+    "messages": (("tx", "rx"), "a row has one stamp of a sender and one of a receiver"),
+    "stamps": (("message",), "a row has one stamp, and a word for transmission or reception"),
+    "ranges": (("range_m",), "there are ranges and no stamps"),
+    "differences": (("difference_m",), f"{SIGN}: exchange the two if it is not"),
+    "nothing": ((), "neither stamps nor ranges were recognised: name their columns below"),
 }
-"""The layouts that are recognised: required columns, excluded columns, and the reason."""
+"""The layouts that are recognised: required columns, and the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,11 +255,11 @@ def _proposal(
             missing |= sentinels(cells[name])
             cells[name] = np.where(np.isin(cells[name], list(missing)), np.nan, cells[name])
     words = {name for name, column in cells.items() if not np.isfinite(column).any()}
-    known = (one for one, (needed, *_) in _LAYOUTS.items() if one != "stamps" and {*needed} <= cells.keys())
+    known = (one for one, (needed, _) in _LAYOUTS.items() if one != "stamps" and {*needed} <= cells.keys())
     layout = "stamps" if "event" in columns else next(known)
     if layout == "nothing" and {"qw", "qx", "qy", "qz"} <= {name.lower() for name in names}:
         raise ImportTableError(f"{path}: contains poses, not ranges; add them to a recording with `uwblink poses`")
-    needed, foreign, why = _LAYOUTS[layout]
+    (needed, why), foreign = _LAYOUTS[layout], NOT_READ.get(layout, OF_MESSAGES)
     if layout == "messages" and "message" in words and columns["message"] != "message":
         del columns["message"], cells["message"]  # without a column of that name the order of messages is used
     top |= {} if layout == "nothing" else {"layout": (layout, why)}

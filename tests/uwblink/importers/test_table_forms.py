@@ -111,6 +111,24 @@ def test_any_delimiter_with_a_byte_order_mark_comments_and_windows_lines(tmp_pat
     same(read_table(path), rows)
 
 
+@pytest.mark.parametrize(
+    ("columns", "text", "unread"),
+    [
+        ("time_s range_m fpp_dbm gt_range note", None, ["'fpp_dbm' (fpp2?)", "'gt_range' (gt_range_m?)"]),
+        ("time range_m fpp", None, ["'time' (time_s?)", "'fpp' (fpp2?)"]),
+        ("time_s range_m fpp1 gt_range_m x2", None, ["'x2' (to_x_m?)"]),
+        ("time_s range_m rxp1 seq note", None, []),
+        ("time_s distance fpp_dbm", '[columns]\nrange_m = "distance"\n', []),
+    ],
+)
+def test_a_note_names_columns_that_are_not_read(tmp_path, columns, text, unread):
+    row = {"from_id": 1, "to_id": 2} | dict.fromkeys(columns.split(), -2)
+    notes = read_rows(tmp_path, [row | {"time" + "_s" * ("time_s" in row): k} for k in range(9)], text).meta["notes"]
+    named = [note for note in notes if "not read" in note]
+    assert len(named) == bool(unread)
+    assert all(one in named[0] for one in unread)
+
+
 def test_several_files_are_one_table(tmp_path, rows):
     paths = [write(tmp_path / f"{k}.csv", wrapped(rows[k::2])) for k in (0, 1)]
     same(read_table(paths), rows)
