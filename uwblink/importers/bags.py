@@ -73,6 +73,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
     for part in path.iterdir() if path.is_dir() else ():
         require_regular(part, ImportTableError, "part of a bag", folders=True)
     wrong = f"{path}: cannot be read as a bag"
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
+        raise ImportTableError(f"{wrong}: the folder has no metadata.yaml, which `ros2 bag reindex` writes")
     with raising(ImportTableError, wrong, OSError, ValueError):
         is_mcap = path.is_file() and path.suffix.lower() == ".mcap"
         if is_mcap and next((encoding == "json" for *_, encoding in _channels(path)), False):

@@ -411,7 +411,7 @@ def test_other_files_than_bags_are_refused(tmp_path):
     (tmp_path / "folder").mkdir()
     for name, more, said in (
         ("no.bag", {}, "cannot be read as a bag"),
-        ("folder", {"importer": "bag"}, "cannot be read as a bag"),
+        ("folder", {"importer": "bag"}, "no metadata.yaml"),
         ("absent.mcap", {}, "no such bag"),
     ):
         with pytest.raises(ImportTableError, match=said):
