@@ -308,6 +308,15 @@ class FitSettings(CheckedSettings):
                 "a sequential fit needs a robust loss, not the mixture; remove one of the two settings",
             ),
             (
+                self.scale_ns is not None and self.fitted_loss == "mixture",
+                "scale_ns",
+                "a scale has no effect on the mixture; choose a robust loss, such as cauchy",
+            ),
+            *(
+                (self.delays_only and value not in (None, {}), name, "has no effect without a curve (`delays_only`)")
+                for name, value in (("reference_power_dbm", self.reference_power_dbm), ("groups", self.groups))
+            ),
+            (
                 self.use == "receptions" and beside != "use",
                 "use",
                 f"receptions cannot be fitted with `{beside}`",
@@ -334,6 +343,12 @@ class FitSettings(CheckedSettings):
                     raise BadInputError(f"tag {tag} is in {seen[tag]!r} and in {name!r}", parameter="groups")
                 seen[tag] = name
         object.__setattr__(self, "groups", {name: tuple(map(int, tags)) for name, tags in (self.groups or {}).items()})
+
+    @property
+    def fitted_loss(self) -> str:
+        """The loss that is fitted: without a curve errors depend on power, which the mixture would take for
+        reflections."""
+        return self.loss or ("cauchy" if self.sequential or self.delays_only else "mixture")
 
     @property
     def excludes_patterns(self) -> str:

@@ -46,7 +46,7 @@ FIRST_SAMPLE, SAMPLE_GROWTH = 9000, 6
 """Ranges of the first sample on which the likelihood is maximised, and the growth of the next samples."""
 
 ROBUST_LOSS = "cauchy"
-"""The loss of ICRA 2023. Without a curve errors depend on power, which the likelihood would take for reflections."""
+"""The loss of ICRA 2023, for the initial guess."""
 
 SCALE_OF_SPREAD = 0.5
 """Scale of a robust loss over the robust spread of the residuals.
@@ -143,7 +143,7 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> RangeFit:
         )
     error = model.ranges.error_m
     blocks = time_blocks(model.ranges.time_ns, model.ranges.session)
-    loss = settings.loss or (ROBUST_LOSS if settings.sequential or settings.delays_only else MIXTURE)
+    loss = settings.fitted_loss
     scale_m = None if settings.scale_ns is None else settings.scale_ns * METRES_A_NS
     if settings.sequential and model.curve is not None and not model.pinned:
         return _fit_in_sequence(model, error, loss, scale_m, blocks)

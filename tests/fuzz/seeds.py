@@ -105,7 +105,7 @@ ALONE: Final = (
     "uwbsim predict --protocol ds-alt --final-delay-us 900 --rx-noise-ps 100 --json",
     "uwbsim optimum {scenario.toml} --protocols ds --overhead-us 10 --json",
     "calib export {calibration.json} --to registers -o {out}",
-    "calib fit {flight.uwb} -o {out} --fix 1=-0.36 --reference-power -82 --scale 0.1",
+    "calib fit {flight.uwb} -o {out} --fix 1=-0.36 --reference-power -82 --loss cauchy --scale 0.1",
     "calib fit {flight.uwb} -o {out} --truth ranges --poses-until 1 --attitudes none --heading-std 3",
 )
 """Commands of which only options are damaged."""

@@ -86,7 +86,7 @@ def run(
     check_output(output, force=force, recording=True)
     loaded = _loaded(scenario, overrides, allow_files, antenna_delays, seed)
     with waiting(loaded.run.name) as report:
-        simulated = uwbsim.simulate(loaded, report, contention=contention)
+        simulated = uwbsim.simulate(loaded, progress=report, contention=contention)
     frames: list[Any] = []
     if wire:
         simulated, frames = uwbsim.through_wire(simulated)

@@ -116,7 +116,7 @@ class Simulated(Contents):
 
 
 def simulate(
-    scenario: Scenario | Source, progress: Callable[[float], None] | None = None, *, contention: bool = True
+    scenario: Scenario | Source, *, progress: Callable[[float], None] | None = None, contention: bool = True
 ) -> Simulated:
     """Simulate a scenario in memory; the same scenario gives the same exchanges on every machine.
 
