@@ -81,6 +81,7 @@ REMEDIES: Final = {
     "no curve": "fit without `delays_only` if the powers of a pair vary",
     "no powers": "record with powers, at several distances and attitudes, to fit a curve",
     "constant power": "record at several distances and attitudes to fit a curve",
+    "reference power without effect": "leave it out, or let the fit determine all delays",
     "reference power": "compare the delays only with those at the same power",
     "too few pairs": "record more tags, or anchors",
     "power confounded with distance": "turn the antennas while recording, or fit with `delays_only`",

@@ -312,10 +312,7 @@ class FitSettings(CheckedSettings):
                 "scale_ns",
                 "a scale has no effect on the mixture; choose a robust loss, such as cauchy",
             ),
-            *(
-                (self.delays_only and value not in (None, {}), name, "has no effect without a curve (`delays_only`)")
-                for name, value in (("reference_power_dbm", self.reference_power_dbm), ("groups", self.groups))
-            ),
+            (self.delays_only and self.groups, "groups", "has no effect without a curve (`delays_only`)"),
             (
                 self.use == "receptions" and beside != "use",
                 "use",

@@ -130,7 +130,6 @@ WORDS = [
     ("calib fit {f_uwb} -o c.json --loss tukey", ["--loss", "tukey"]),
     ("calib fit {f_uwb} -o c.json --scale -1", ["--scale", "-1"]),
     ("calib fit {f_uwb} -o c.json --scale 1", ["--scale", "mixture"]),
-    ("calib fit {f_uwb} -o c.json --delays-only --reference-power -85", ["--reference-power", "--delays-only"]),
     ("calib fit {f_uwb} -o c.json --lift up", ["--lift", "up"]),
     ("calib fit {f_uwb} -o c.json --fix 1", ["--fix", "'1'", "TAG=NS"]),
     ("calib fit {f_uwb} -o c.json --fold pair", ["--fold", "pair", "--hold-out"]),

@@ -116,9 +116,20 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         ]
         if unused
         else [],
-        more=[*vague, *effects_of_supply(calibration.temperatures, ranges), *_convergence(found, settings.loss)],
+        more=[
+            *vague,
+            *effects_of_supply(calibration.temperatures, ranges),
+            *_settings_without_effect(found, settings),
+            *_convergence(found, settings.loss),
+        ],
     )
     return replace(result, held_out=held)
+
+
+def _settings_without_effect(found: RangeFit, settings: FitSettings) -> Iterator[Finding]:
+    if settings.reference_power_dbm is not None and all(one is None for one in found.model.carriers):
+        why = "no curve is fitted" if found.model.curve is None else "known delays determine the constant of the curve"
+        yield warning("reference power without effect", f"the reference power has no effect: {why}")
 
 
 def _provenance(found: RangeFit, ranges: Ranges, settings: FitSettings) -> dict[str, Any]:

@@ -48,6 +48,13 @@ def test_an_unrecorded_reference_power_has_a_warning(reference_dbm, nearest):
     assert [f"{power} dBm" in said for power in (reference_dbm, nearest)] == [True, True]
 
 
+@pytest.mark.parametrize("settings", [{"fixed_ns": {1: -0.3}}, {"delays_only": True}, {"sequential": True}, {}])
+def test_a_warning_states_that_a_reference_power_has_no_effect(settings):
+    texts = calib.fit(ranges(n=2000), reference_power_dbm=-85.0, **settings).warnings
+    without_effect = "fixed_ns" in settings or "delays_only" in settings
+    assert any("reference power has no effect" in text for text in texts) == without_effect
+
+
 def test_ranges_left_out_as_static_have_no_warning():
     some = ranges(600)
     asked, missing = (calib.fit(replace(some, excluded={why: 400})) for why in ("static", "no power"))
