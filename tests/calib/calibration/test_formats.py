@@ -3,6 +3,8 @@
 import csv
 import json
 import math
+import shutil
+import subprocess
 import tomllib
 from dataclasses import replace
 
@@ -11,8 +13,7 @@ import pytest
 
 import calib
 from calib.calibration.formats import programmed, read_miluv, registers
-from calib.calibration.patterns import Pattern
-from tests.calib.c_header import printed
+from calib.calibration.patterns import Pattern, TemperatureSlope
 from tests.calib.synthetic import DELAYS_NS, ranges
 from tests.shared_data import miluv, shared
 from uwblink.importers import read_source
@@ -50,7 +51,21 @@ def test_registers_add_to_programmed_delays(tmp_path, fitted):
     assert tomllib.loads(text)["antenna_delays"]["tags"]["1"] == found[1]._asdict()
 
 
-MAIN = """
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
+
+
+def printed(folder, known, main, text=""):
+    """Return the output of a program that includes the header of a calibration; skips without a compiler."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("no C compiler on this machine")
+    calib.export(known, "c-header", folder / "calibration.h")
+    (folder / "main.c").write_text(main)
+    subprocess.run([compiler, *STRICT, "main.c", "-o", "main", "-lm"], cwd=folder, check=True)
+    return subprocess.run(["./main"], cwd=folder, input=text, capture_output=True, text=True, check=True).stdout
+
+
+CORRECTING = """
 #include <stdio.h>
 #include "calibration.h"
 int main(void)
@@ -108,7 +123,7 @@ def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
     lines = [f"{r!r} {a!r} {b!r} {i:.0f} {j:.0f}" for r, a, b, i, j in [*rows.tolist(), (1.0, -85.0, -85.0, 9999, one)]]
     toward = [" ".join(map(str, six)) for six in [*away.reshape(-1, 6).astype(float).tolist(), range(6)]]
     text = "\n".join(f"{line} {six}" for line, six in zip(lines, toward, strict=True))
-    *found, strange = (line.split() for line in printed(tmp_path, known, MAIN, text).splitlines())
+    *found, strange = (line.split() for line in printed(tmp_path, known, CORRECTING, text).splitlines())
     status, values = np.array(found)[:, 0], np.array(found, dtype=float)[:, 1:]
     ends = rows[:, 3:].astype(int)
     undetermined = np.array([sum(known.sides.get(tag, 0) for tag in pair) != 0 for pair in ends.tolist()])
@@ -130,6 +145,36 @@ def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
     assert set(kinds) == {"0", "1", "2"}
     changed = np.mean(np.abs(corrected - blind.range_m) > 1e-3)
     assert changed == pytest.approx(0.9 if known.patterns else 0.0, abs=0.15)
+
+
+WARM = """
+#include <stdio.h>
+#include "calibration.h"
+int main(void)
+{
+    const double celsius[][2] = {{30.0, 24.5}, {30.0, NAN}, {NAN, NAN}};
+    double x, unknown, longer;
+    int k;
+    (void)uwb_correct(1, 0, 0, 1, 2, &x, 0);
+    (void)uwb_errors(0, 0, 1, 2, &x, &x, &x);
+    for (k = 0; k < 3; k++) {
+        longer = uwb_warmth(1, 3, celsius[k][0], celsius[k][1], &unknown);
+        printf("%.17g %.17g ", longer, unknown);
+    }
+    return 0;
+}
+"""
+
+
+def test_the_c_header_states_the_effect_of_temperatures(tmp_path, fitted):
+    slopes = (TemperatureSlope((1, 2, 3, 7), 0.005, 0.0002, 27.5, (20.0, 35.0)),)
+    known, expected = replace(fitted, temperatures=slopes), list[float]()
+    plain = fitted.correct(3.0, -85.0, -86.0, 1, 3)
+    for celsius in ((30.0, 24.5), (30.0, np.nan), (np.nan, np.nan)):
+        seen = known.correct(3.0, -85.0, -86.0, 1, 3, temperature_c=celsius)
+        expected += [plain.range_m - seen.range_m, seen.sigma_total_m**2 - plain.sigma_total_m**2]
+    # Temperatures have single precision: 2e-6 K of 30.
+    assert list(map(float, printed(tmp_path, known, WARM).split())) == pytest.approx(expected, abs=1e-8, rel=1e-5)
 
 
 def test_miluv_is_read_and_given_back_unchanged():

@@ -16,13 +16,16 @@ import uwbsim
 from benchmarks import doctor as planted
 from benchmarks.flights import Flight, Plan, fly
 from benchmarks.worlds import CLEAN, PLANTED, Recipe, make
+from calib.checks import examined_part, recording_view
 from calib.checks.examine import CHECKS, FINDING_LEVEL, IMPLIED
+from calib.data.sources import RecordedSource
 from calib.findings import BUDGET, CERTAIN, FIT_LEVELS, OF_A_FIT, Candidate, Check, exceeds
 from docs.site import checks
 from tests import processes
 from tests.calib.fitting.fields import ranges_with_field
 from tests.calib.synthetic import about_their_mean, lifted
 from tests.shared_data import ROOT, rows_of, shared
+from uwblink.recording.distances import distances_m
 
 RNG = np.random.default_rng
 
@@ -91,8 +94,8 @@ def test_the_command_prints_findings_clocks_and_p_values(tmp_path):
 @pytest.mark.parametrize("command", ["doctor", "fit"])
 def test_a_recording_that_is_given_twice_is_refused_under_any_name(tmp_path, command):
     paths = [save(fly(Plan(seconds=5, per_second=60), 94, 5), tmp_path / name) for name in ("one.uwb", "other.uwb")]
-    output = ["-o", tmp_path / "calibration.json"] if command == "fit" else []
-    for second in (paths[0], paths[1]):
+    output = [] if command == "doctor" else ["-o", tmp_path / "calibration.json"]
+    for second in paths:
         same = f"{second.name}: contains the same exchanges as one.uwb"
         processes.refuse("calib", command, paths[0], second, *output, naming=[same])
     assert not (tmp_path / "calibration.json").exists()
@@ -347,3 +350,66 @@ def test_noise_of_powers_is_not_called_places_only(noise_db, seed, place):
     places = [text for text in warnings if text.startswith(("errors depend", "ranges grow", "pair"))]
     assert len(places) == place
     assert all("or the powers are noisy" in text for text in places)
+
+
+# A long recording is examined in stretches of time, and its faults are detected in them.
+
+
+PLAN = Plan(seconds=300, per_second=80)
+EXAMINED_EXCHANGES, EXAMINED_STRETCHES = 6_000, 12
+
+
+@pytest.fixture
+def short_stretches(monkeypatch):
+    monkeypatch.setattr(recording_view, "EXAMINED_EXCHANGES", EXAMINED_EXCHANGES)
+    monkeypatch.setattr(recording_view, "EXAMINED_STRETCHES", EXAMINED_STRETCHES)
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return fly(PLAN, 51)
+
+
+@pytest.fixture(scope="module")
+def path(flight, tmp_path_factory):
+    return save(flight, tmp_path_factory.mktemp("long") / "long.uwb")
+
+
+@pytest.mark.usefixtures("short_stretches")
+def test_stretches_cover_the_recording_and_have_all_poses(flight, path):
+    with uwblink.Recording.open(path) as recording:
+        looked = recording_view.select_part(RecordedSource(recording))
+    x, every = looked.exchanges, flight.exchanges
+    assert len(every) == 24_000
+    assert len(x) == pytest.approx(EXAMINED_EXCHANGES, rel=0.02)
+    assert np.count_nonzero(np.diff(x.time_ns) > 1_000_000_000) == EXAMINED_STRETCHES - 1
+    assert (x.time_ns[0], x.time_ns[-1]) == (every.time_ns[0], every.time_ns[-1])
+    ends = x.initiator, x.target, x.time_ns
+    np.testing.assert_array_equal(
+        distances_m(looked.poses, looked.tags, *ends), distances_m(flight.poses, flight.tags, *ends)
+    )
+
+
+@pytest.mark.usefixtures("short_stretches")
+def test_sound_recordings_have_no_finding_and_the_examined_part_is_stated(path):
+    assert calib.examine(path) == []
+    assert examined_part(24_000) == (
+        "about 6000 of its 24000 exchanges were examined, in 12 stretches over all of its time"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short_stretches")
+def test_late_poses_are_found_with_their_delay(flight, tmp_path):
+    late = replace(flight.poses, time_ns=flight.poses.time_ns + 400_000_000)
+    (finding,) = calib.examine(save(replace(flight, poses=late), tmp_path / "late.uwb"))
+    assert finding.fault == "pose time offset"
+    assert "-0.400 s" in finding.evidence or "-0.39" in finding.evidence
+
+
+@pytest.mark.usefixtures("short_stretches")
+def test_short_recordings_are_examined_completely(path, monkeypatch):
+    monkeypatch.setattr(recording_view, "EXAMINED_EXCHANGES", 24_000)
+    with uwblink.Recording.open(path) as recording:
+        assert len(recording_view.select_part(RecordedSource(recording)).exchanges) == 24_000
+    assert examined_part(24_000) == ""

@@ -17,7 +17,7 @@ from calib.evaluation.localization import (
     write_tum,
 )
 from calib.evaluation.tracking import Settings, problems
-from calib.online import RangeErrors, Reflections, gated_update, mixture_update
+from calib.online import RangeErrors, Reflections, mixture_update
 from calib.report.figures import rmse_bars
 from tests.calib.synthetic import calibration, constant_curve
 from tests.shared_data import ROOT
@@ -269,12 +269,6 @@ def test_extreme_innovations_are_finite_and_rejected():
     assert np.isfinite(update.noise_m).all()
     np.testing.assert_allclose(update.noise_m, 0, atol=1e-6)
     np.testing.assert_allclose(update.variance_m2, STD**2, rtol=1e-6)
-
-
-def test_a_gate_accepts_or_rejects():
-    update = gated_update(np.array([0.2, 0.4]), np.full(2, 0.01), 9.0)
-    assert (update.accepted.tolist(), update.noise_m.tolist()) == ([True, False], [0.2, 0.0])
-    assert update.variance_m2.tolist() == [0.0, 0.01]
 
 
 def test_probabilities_of_reflections_agree_with_all_histories():

@@ -17,7 +17,6 @@ from calib.calibration import held_out_line
 from calib.calibration.patterns import TemperatureSlope
 from calib.data.ranges import read_c
 from tests.calib import overhearing
-from tests.calib.c_header import printed
 from tests.processes import refuse, run
 from tests.uwblink.importers.test_table_forms import as_messages, flights, wrapped, write
 from uwblink.importers.guess import guess_map
@@ -178,37 +177,6 @@ def test_faulty_provenance_is_refused_in_a_line(tmp_path, broken, why):
     refuse("calib", "show", tmp_path / "c.json", naming=[why])
     with pytest.raises(calib.BadInputError, match="provenance: held_out"):
         held_out_line(replace(fitted(WARM, 3), provenance={"held_out": broken}))
-
-
-MAIN = """
-#include <stdio.h>
-#include "calibration.h"
-int main(void)
-{
-    const double celsius[][2] = {{30.0, 24.5}, {30.0, NAN}, {NAN, NAN}};
-    double x, unknown, longer;
-    int k;
-    (void)uwb_correct(1, 0, 0, 1, 2, &x, 0);
-    (void)uwb_errors(0, 0, 1, 2, &x, &x, &x);
-    for (k = 0; k < 3; k++) {
-        longer = uwb_warmth(1, 3, celsius[k][0], celsius[k][1], &unknown);
-        printf("%.17g %.17g ", longer, unknown);
-    }
-    return 0;
-}
-"""
-
-
-def test_the_c_header_states_the_effect_of_temperatures(tmp_path):
-    found = printed(tmp_path, fitted(WARM, 3), MAIN).split()
-    known, blind = fitted(WARM, 3), replace(fitted(WARM, 3), temperatures=())
-    at = (3.0, -85.0, -86.0, 1, 3)
-    plain, expected = blind.correct(*at), list[float]()
-    for celsius in ((30.0, 24.5), (30.0, np.nan), (np.nan, np.nan)):
-        seen = known.correct(*at, temperature_c=celsius)
-        expected += [plain.range_m - seen.range_m, seen.sigma_total_m**2 - plain.sigma_total_m**2]
-    # Temperatures have single precision: 2e-6 K of 30.
-    assert list(map(float, found)) == pytest.approx(expected, abs=1e-8, rel=1e-5)
 
 
 def test_temperatures_lie_between_readings_and_end_half_a_minute_after_the_last():
