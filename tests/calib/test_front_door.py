@@ -49,25 +49,28 @@ def test_public_results_print_on_a_screen():
         assert max(map(len, text.splitlines())) <= 120, type(thing)
 
 
-def test_other_objects_than_calibrations_are_refused(tmp_path):
+@pytest.mark.parametrize("wrong", [None, 3, {}], ids=str)
+@pytest.mark.parametrize(
+    ("call", "parameter"),
+    [
+        (lambda wrong, _: calib.evaluate(calib.sample_flight(), wrong), "calibration"),
+        (lambda wrong, _: calib.localize(calib.sample_flight(), wrong), "calibration"),
+        (lambda wrong, _: calib.export(wrong, "csv"), "calibration"),
+        (lambda wrong, _: calib.compare(calib.fit(calib.sample_flight(300)), wrong), "second"),
+        (lambda wrong, folder: calib.apply(folder / "f.uwb", wrong, folder / "g.uwb"), "calibration"),
+        (lambda wrong, folder: calib.write_report(folder / "r.html", calib.sample_flight(), wrong), "calibration"),
+    ],
+    ids=["evaluate", "localize", "export", "compare", "apply", "write_report"],
+)
+def test_other_objects_than_calibrations_are_refused(tmp_path, call, parameter, wrong):
+    with pytest.raises(calib.BadInputError, match=f"^`{parameter}`.*expected a Calibration"):
+        call(wrong, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_results_and_paths_are_accepted_like_calibrations(tmp_path):
     flight = calib.sample_flight()
     result = calib.fit(flight)
-    calls: dict[str, Any] = {
-        "evaluate": lambda wrong: calib.evaluate(flight, wrong),
-        "localize": lambda wrong: calib.localize(flight, wrong),
-        "export": lambda wrong: calib.export(wrong, "csv"),
-        "compare": lambda wrong: calib.compare(result.calibration, wrong),
-        "apply": lambda wrong: calib.apply(tmp_path / "f.uwb", wrong, tmp_path / "g.uwb"),
-        "write_report": lambda wrong: calib.write_report(tmp_path / "r.html", flight, wrong),
-    }
-    no_calibrations: tuple[Any, ...] = (None, 3, {})
-    for wrong in no_calibrations:
-        for name, call in calls.items():
-            with pytest.raises(calib.BadInputError, match="expected a Calibration") as caught:
-                call(wrong)
-            assert caught.value.parameter == ("second" if name == "compare" else "calibration")
-    assert list(tmp_path.iterdir()) == []
-    # A result and the path of a calibration are accepted like the calibration.
     result.save(tmp_path / "c.json")
     with pytest.raises(FileExistsError):
         result.save(tmp_path / "c.json")
@@ -89,9 +92,8 @@ def fitted():
 
 def axes_of(draw):
     with figures.style():
-        figure = Figure(figsize=(7.16, 3), layout="constrained")
-        axes = draw(figure.subplots())
-        figure.draw_without_rendering()
+        axes = draw(Figure(figsize=(7.16, 3), layout="constrained").subplots())
+        axes.figure.draw_without_rendering()
     return axes
 
 
@@ -105,19 +107,10 @@ def points_and_curve(axes):
     return points, np.interp(points.get_xdata(), curve.get_xdata(), curve.get_ydata())
 
 
-def test_points_are_the_core_and_medians_lie_above():
-    # Planted: a core of 5 cm about zero, a fifth of it lengthened by 40 cm on average.
-    rng = np.random.default_rng(5)
-    error = rng.normal(0, 0.05, 40_000) + np.where(rng.random(40_000) < 0.2, rng.exponential(0.4, 40_000), 0)
-    everything = {"": (np.arange(40_000), 20)}
-    found = binned(rng.uniform(0, 1.5, 40_000), error, everything, "mixture")[""]
-    # 2000 ranges in a bin determine the centre to 1.5 mm, and the spread, estimated with the tail, to 2 mm.
-    assert np.abs(found.centre_m).max() < 0.006
-    assert np.abs(found.centre_m.mean()) < 0.001
-    assert found.std_m == pytest.approx(0.05, abs=0.008)
-    assert found.median_m.mean() == pytest.approx(0.0145, abs=0.003)
-    squares = binned(np.arange(40_000.0), error, everything, "l2")[""]
-    assert squares.centre_m.mean() == pytest.approx(error.mean(), abs=1e-9)
+def test_points_of_least_squares_are_means():
+    error = np.random.default_rng(5).exponential(0.4, 40_000)
+    found = binned(np.arange(40_000.0), error, {"": (np.arange(40_000), 20)}, "l2")[""]
+    assert found.centre_m.mean() == pytest.approx(error.mean(), abs=1e-9)
 
 
 def test_the_drawn_curve_goes_through_the_drawn_points(fitted):
@@ -130,25 +123,24 @@ def test_the_drawn_curve_goes_through_the_drawn_points(fitted):
     away = points.get_ydata() - (100 * bias_m(points.get_xdata()))
     assert np.abs(away - away.mean()).max() < 1.2, "and both follow what was planted"
     (top,) = axes.child_axes  # first-path powers in dBm
-    for place, text in zip(top.get_xticks(), top.get_xticklabels(), strict=True):
-        assert 10 ** ((float(text.get_text().replace("−", "-")) + 82) / 10) == pytest.approx(place)
+    dbm = np.array([float(text.get_text().replace("−", "-")) for text in top.get_xticklabels()])
+    assert 10 ** ((dbm + 82) / 10) == pytest.approx(top.get_xticks())
 
 
-def test_curves_with_few_points_are_drawn_completely(fitted):
-    faint = fitted.ranges[fitted.ranges.fpp1_dbm < np.median(fitted.ranges.fpp1_dbm)]
-    known = fitted.calibration
-    axes = axes_of(lambda a: curve_over_power(faint, known.apply(faint), known, "bias", a))
-    (low, high), drawn = axes.get_ylim(), labelled(axes, "fitted").get_ydata()
-    assert low < drawn.min() < drawn.max() < high
+def test_curves_with_few_points_are_drawn_completely_or_where_the_ranges_are(fitted):
+    power, known = fitted.ranges.fpp1_dbm, fitted.calibration
 
+    def drawn(quantile, known):
+        faint = fitted.ranges[power < np.quantile(power, quantile)]
+        return faint, axes_of(lambda a: curve_over_power(faint, known.apply(faint), known, "bias", a))
 
-def test_a_curve_is_drawn_where_the_ranges_are_if_it_is_flat_elsewhere(fitted):
-    known = fitted.calibration
+    _, axes = drawn(0.5, known)
+    (low, high), curve = axes.get_ylim(), labelled(axes, "fitted").get_ydata()
+    assert low < curve.min() < curve.max() < high
+    # Far outside of its points it would flatten the figure.
     steep = Curve((0.0,) * 4 + (0.5, 1.0) + (15.0,) * 4, (-0.2, -0.18, 0.04, 0.04, 0.04, 0.04), 3, (0.0, 15.0))
-    faint = fitted.ranges[fitted.ranges.fpp1_dbm < np.quantile(fitted.ranges.fpp1_dbm, 0.3)]
-    changed = replace(known, bias_curve=steep, uncertainty=None)
-    low, high = axes_of(lambda a: curve_over_power(faint, changed.apply(faint), changed, "bias", a)).get_ylim()
-    of_ranges = 100 * steep(changed.lifted(faint))
+    faint, axes = drawn(0.3, replace(known, bias_curve=steep, uncertainty=None))
+    (low, high), of_ranges = axes.get_ylim(), 100 * steep(known.lifted(faint))
     assert np.mean((of_ranges > low) & (of_ranges < high)) > 0.9
 
 
@@ -182,9 +174,8 @@ def test_a_histogram_shows_corrected_errors_whatever_raw_ones_are(fitted, offset
 def test_the_distribution_shows_shares_of_smaller_errors(fitted):
     applied = fitted.calibration.apply(fitted.ranges)
     line = labelled(axes_of(lambda a: cumulative(fitted.ranges, applied, a)), "fully corrected")
-    size = 100 * np.abs(applied.corrected_m - fitted.ranges.truth_m)
-    for x, y in zip(line.get_xdata()[::20], line.get_ydata()[::20], strict=True):
-        assert 100 * np.mean(size <= x) == pytest.approx(y, abs=0.1)
+    size, (x, y) = 100 * np.abs(applied.corrected_m - fitted.ranges.truth_m), line.get_data()
+    assert 100 * np.mean(size[:, None] <= x, axis=0) == pytest.approx(y, abs=0.1)
 
 
 def test_undetermined_delays_are_drawn_as_circles(fitted):
