@@ -257,9 +257,9 @@ def test_temperatures_of_rows_that_are_messages_are_named_as_not_read(tmp_path):
 )
 def test_readings_of_no_range_and_degrees_fahrenheit_have_a_warning(tag, later_s, celsius, said):
     flight = calib.sample_flight()
-    time_ns, count = flight.exchanges.time_ns, len(flight.exchanges)
-    readings = {"time_ns": time_ns + later_s * 10**9, "tag": np.full(count, tag), "supply_v": np.full(count, np.nan)}
-    readings["temperature_c"] = np.linspace(celsius - 10, celsius + 10, count)
+    count = len(flight.exchanges)
+    readings = {"time_ns": flight.exchanges.time_ns + later_s * 10**9, "tag": np.full(count, tag)}
+    readings |= {"temperature_c": np.linspace(celsius - 10, celsius + 10, count), "supply_v": np.full(count, np.nan)}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         calib.load_ranges(replace(flight, temperature=readings))
@@ -269,13 +269,12 @@ def test_readings_of_no_range_and_degrees_fahrenheit_have_a_warning(tag, later_s
 
 def test_exact_ranges_of_a_data_frame_with_hot_boards_fit_and_warn_at_the_line_of_the_caller():
     rng = np.random.default_rng(3)
-    away = rng.uniform(1, 5, 300)
-    first, next_one = rng.integers(0, 3, 300), rng.integers(1, 3, 300)
+    away, first = rng.uniform(1, 5, 300), rng.integers(0, 3, 300)
     hot = pandas.DataFrame(
         {
             "t": 0.1 * np.arange(300),
             "initiator": first,
-            "target": (first + next_one) % 3,
+            "target": (first + rng.integers(1, 3, 300)) % 3,
             "range": away + 0.1,
             "true": away,
             "fpp1": rng.uniform(-95, -80, 300),
@@ -286,5 +285,5 @@ def test_exact_ranges_of_a_data_frame_with_hot_boards_fit_and_warn_at_the_line_o
     with pytest.warns(calib.errors.TemperatureWarning, match="Fahrenheit") as caught:
         found = calib.fit(hot).calibration
     assert {one.filename for one in caught} == {__file__}
-    assert list(found.delays_ns.values()) == pytest.approx([-0.1 / 0.299702547] * 3, abs=1e-6)
+    assert found.delays_ns == pytest.approx(dict.fromkeys(range(3), -0.1 / 0.299702547), abs=1e-6)
     assert not found.temperatures
