@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from threadpoolctl import threadpool_limits
 
 import calib
@@ -60,6 +61,11 @@ def test_ranges_left_out_have_a_warning_unless_they_are_static():
     assert [warning for warning in missing if "25 % of the exchanges were left out: no power" in warning]
 
 
+def test_single_sided_ranges_without_reply_times_have_a_warning():
+    found = calib.fit(replace(ranges(3000), protocol=np.full(3000, "ss")))
+    assert [warning for warning in found.warnings if "single-sided ranges without reply times" in warning]
+
+
 @pytest.mark.parametrize(("by_m", "way"), [(0.3, "longer"), (-0.3, "shorter")])
 def test_the_sign_of_a_pairs_error_is_stated(by_m, way):
     some = ranges(3000, tail=0)
@@ -69,19 +75,17 @@ def test_the_sign_of_a_pairs_error_is_stated(by_m, way):
     found = calib.fit(replace(some, initiator=first, target=second, raw_m=some.raw_m + off))
     (named,) = [one for one in found.findings if one.evidence.startswith("pair 2-7") and "initiates" in one.evidence]
     assert f"{way} if tag 2 initiates" in named.evidence
-    assert named.p_value is not None
-    assert 0 < named.p_value < 1e-6
+    assert 0 < (named.p_value or 0) < 1e-6
 
 
 @pytest.mark.slow
 def test_the_mixture_estimates_delays_better_than_a_loss():
-    errors: dict[str, list[float]] = {"cauchy": [], "mixture": []}
-    for seed in range(4):
-        r = ranges(6000, tail=0.3, seed=seed)
-        for loss, found in errors.items():
-            found += about_their_mean(calib.fit(r, loss=loss).calibration, DELAYS_NS)[0].tolist()
-    spread = {loss: np.std(found) for loss, found in errors.items()}
-    assert spread["mixture"] < 0.9 * spread["cauchy"]
+    worlds = [ranges(6000, tail=0.3, seed=seed) for seed in range(4)]
+    cauchy, mixture = (
+        np.std([about_their_mean(calib.fit(r, loss=loss).calibration, DELAYS_NS)[0] for r in worlds])
+        for loss in ("cauchy", "mixture")
+    )
+    assert mixture < 0.9 * cauchy
 
 
 @pytest.mark.slow
@@ -99,8 +103,7 @@ def test_a_pinned_delay_stays_and_determines_a_single_pair():
     # The curve is zero at its reference; the planted one is not, and the other delay compensates that.
     c = calib.fit(pair, fixed_ns={1: DELAYS_NS[1]}).calibration
     assert c.delays_ns[1] == DELAYS_NS[1]
-    grid = np.linspace(*c.bias_curve.range, 400)
-    both = 0.5 * (c.delays_ns[2] - DELAYS_NS[2]) * 1e-9 * SPEED_OF_LIGHT
+    grid, both = np.linspace(*c.bias_curve.range, 400), 0.5 * (c.delays_ns[2] - DELAYS_NS[2]) * 1e-9 * SPEED_OF_LIGHT
     assert np.sqrt(np.mean((c.bias_curve(grid) - both - bias_m(grid)) ** 2)) < 0.01
 
 
@@ -115,11 +118,11 @@ def test_ranges_without_any_error_have_no_delays_and_no_curve(loss):
 @pytest.mark.slow
 def test_a_fit_is_the_same_to_the_last_digit_whatever_the_number_of_threads():
     # Sums by several threads have other last digits than those by one.
-    found = []
+    found = set()
     for threads in (1, 4):
         with threadpool_limits(threads, user_api="blas"):
-            found.append(calib.fit(ranges(6000)).calibration.to_json())
-    assert found[0] == found[1]
+            found.add(calib.fit(ranges(6000)).calibration.to_json())
+    assert len(found) == 1
 
 
 def test_ranges_far_too_short_are_counted_as_outliers():
@@ -177,11 +180,8 @@ def test_the_band_of_the_curve_includes_the_uncertain_smoothness(monkeypatch):
     ],
 )
 def test_wrong_settings_are_named(parameter, value):
-    with pytest.raises(calib.BadInputError) as caught:
+    with pytest.raises(calib.BadInputError, match=rf"(?s)^`{parameter}`: ((?!--).)*$"):
         calib.fit(ranges(300), **{"loss": "mixture", parameter: value})
-    assert caught.value.parameter == parameter
-    assert str(caught.value).startswith(f"`{parameter}`: ")
-    assert "--" not in str(caught.value)
 
 
 def test_numpy_numbers_are_numbers():
@@ -328,15 +328,13 @@ def test_html_is_escaped(result):
     assert page.count("<tr>") == page.count("</tr>") == 1 + len(DELAYS_NS) + 3
 
 
-def test_results_draw_into_axes(result):
-    from matplotlib import pyplot
-
-    for draw in (result.plot_bias, result.plot_sigma, result.plot_residuals, result.plot_delays):
-        axes = pyplot.figure().subplots()
-        assert draw(axes) is axes
-        assert axes.get_xlabel()
-        assert axes.get_legend()
-    assert result.plot_delays().figure in [pyplot.figure(number) for number in pyplot.get_fignums()]
+@pytest.mark.parametrize("name", ["plot_bias", "plot_sigma", "plot_residuals", "plot_delays"])
+def test_results_draw_into_axes(result, name):
+    axes, draw = pyplot.figure().subplots(), getattr(result, name)
+    assert draw(axes) is axes
+    assert axes.get_xlabel()
+    assert axes.get_legend()
+    assert draw().figure in [pyplot.figure(number) for number in pyplot.get_fignums()]
     pyplot.close("all")
 
 
@@ -374,9 +372,8 @@ def test_groups_of_tags_get_their_own_curves():
     assert (calib.Calibration.from_json(c.to_json()), json.loads(c.to_json())["schema_version"]) == (c, 2)
     # A range between the groups has the mean of both curves, which is zero here.
     r = grouped(ranges(3000, seed=8), groups)
-    applied = c.apply(r)
-    assert np.median(np.abs(np.median(applied.corrected_m - r.truth_m))) < 0.02
-    mixed = np.isin(r.initiator, (1, 2)) != np.isin(r.target, (1, 2))
+    applied, mixed = c.apply(r), np.isin(r.initiator, (1, 2)) != np.isin(r.target, (1, 2))
+    assert abs(np.median(applied.corrected_m - r.truth_m)) < 0.02
     assert np.std((applied.delay_corrected_m - applied.corrected_m)[mixed]) < 0.006
 
 
@@ -395,9 +392,8 @@ def test_a_reference_power_moves_a_constant_and_corrects_ranges_alike(settings):
 
 
 def test_the_band_contains_the_curve():
-    inside = []
-    for seed in range(3):
-        c = calib.fit(ranges(4000, seed=seed)).calibration
+    fits, inside = (calib.fit(ranges(4000, seed=seed)).calibration for seed in range(3)), []
+    for c in fits:
         grid = np.linspace(*c.bias_curve.range, 50)
         wrong = c.bias_curve(grid) - bias_m(grid)
         inside.append(np.abs(wrong - wrong.mean()) < 1.96 * np.asarray(c.band(grid, "bias"), dtype=float))
@@ -425,12 +421,12 @@ def test_static_spans_are_left_out():
 
 
 def test_power_that_varies_with_distance_causes_a_warning():
-    r = ranges(5000)
-    assert not any("confounded" in warning for warning in calib.fit(r).warnings)
-    rng = np.random.default_rng(1)
+    assert not any("confounded" in warning for warning in calib.fit(ranges(5000)).warnings)
     # Lifted power decreases linearly with distance: a curve over power may be an error by distance.
-    power = -82 + 10 * np.log10(3.0 - 0.45 * r.truth_m + rng.normal(size=(2, len(r))) * 0.01)
-    found = calib.fit(replace(ranges(5000, bias=lambda lifted: 0.1 * lifted), fpp1_dbm=power[0], fpp2_dbm=power[1]))
+    r = ranges(5000, bias=lambda lifted: 0.1 * lifted)
+    noise = np.random.default_rng(1).normal(size=(2, len(r))) * 0.01
+    fpp1, fpp2 = -82 + 10 * np.log10(3.0 - 0.45 * r.truth_m + noise)
+    found = calib.fit(replace(r, fpp1_dbm=fpp1, fpp2_dbm=fpp2))
     assert any("confounded" in warning for warning in found.warnings)
     assert found.calibration.provenance["warnings"] == found.warnings
 
