@@ -279,7 +279,7 @@ def changed(known: calib.Calibration, **parts) -> calib.Calibration:
 def test_good_calibrations_are_fit_for_use(known, unseen):
     text, met = told(known, unseen)
     assert text.kind == "good"
-    assert text.text.startswith("Fit for use. ")
+
     assert len(met) == 7, "nothing was localized, and distances were known"
     assert set(met.values()) == {"✓ yes"}
 
@@ -331,7 +331,7 @@ def of_other_boards(known, unseen):
 def test_changed_boards_make_a_calibration_unfit(known, unseen, change, question, words):
     text, met = told(*change(known, unseen))
     assert (text.kind, met[question]) == ("bad", "✗ no")
-    assert text.text.startswith("Not fit for use. ")
+
     assert words in text.text
     # A few powers outside of the fitted ones are a reservation.
     assert change != stronger or told(*stronger(known, unseen, 0.12))[1][question] == "! in part"
@@ -383,8 +383,7 @@ def foundations(known: calib.Calibration) -> list[Any]:
 
 
 def test_reports_of_surveys_have_positions_and_reflected_pairs(surveyed):
-    heading, text, places, picture, *rest = foundations(surveyed.calibration)
-    table = rest[-1]
+    heading, text, places, picture, *_, table = foundations(surveyed.calibration)
     assert [type(block) for block in (text, places, picture, table)] == [Text, Table, Picture, Table]
     assert heading == Heading("Known facts")
     assert "36 mean ranges of pairs in 6 arrangements" in text.text
@@ -409,7 +408,7 @@ def test_reports_without_motion_capture_state_known_facts(known):
     assert list(grades(blind).values()) == ["doubt"]
 
 
-def test_reports_of_surveys_and_their_evaluation_state_known_facts(surveyed, tmp_path, monkeypatch):
+def test_reports_of_surveys_state_known_facts(surveyed, tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "drawn", pages.outline)  # as above
     page = tmp_path / "page.html"
     write_survey_report(page, surveyed.calibration)
@@ -417,6 +416,9 @@ def test_reports_of_surveys_and_their_evaluation_state_known_facts(surveyed, tmp
     assert [part in text for part in ("Fit for use", "Known facts", '"surveyed"')] == [True, True, False]
     with pytest.raises(UwblinkError, match=r"page\.html"):
         write_survey_report(page, surveyed.calibration)
+
+
+def test_evaluations_of_surveys_state_known_facts(surveyed):
     flight = calib.load_ranges(calib.sample_flight(600))
     delays = dict.fromkeys(flight.tags(), 0.0)
     judged = replace(surveyed.calibration, delays_ns=delays, delays_std_ns={}, uncertainty=None)

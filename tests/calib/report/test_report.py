@@ -128,8 +128,8 @@ def test_a_campaign_s_tables_have_the_numbers_of_its_test(campaign):
     assert mean == pytest.approx(np.mean(tracked, axis=0), abs=1.1e-3)
     assert against == pytest.approx(100 * (mean[1:] / mean[0] - 1), abs=1.0)
     text = re.sub(r"<[^>]*>", "", (campaign / "r.html").read_text())
-    told = re.search(r"the mean NIS is .*? pass the gate", text, re.DOTALL)[0]
-    nis, one, _, low, high, _, nees, three, nees_low, nees_high, *_ = map(float, re.findall(r"\d+(?:\.\d+)?", told))
+    said = re.search(r"the mean NIS is .*? pass the gate", text, re.DOTALL)[0]
+    nis, one, _, low, high, _, nees, three, nees_low, nees_high, *_ = map(float, re.findall(r"\d+(?:\.\d+)?", said))
     # Bounds of a mean square are about its expectation: one of a range, three of a position.
     assert (one, three) == (1, 3)
     assert low < 1 < high < 2 < nees_low < 3 < nees_high
