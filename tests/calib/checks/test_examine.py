@@ -41,8 +41,16 @@ def faults(flight):
 
 
 def only(flight, fault):
-    (found,) = [one for one in calib.examine(flight) if one.fault == fault]
+    (found,) = (one for one in calib.examine(flight) if one.fault == fault)
     return found
+
+
+def true_m(flight):
+    return calib.Ranges.from_exchanges(flight.exchanges, poses=flight.poses, tags=flight.tags).truth_m
+
+
+def anchors_and_tag(seed):
+    return uwbsim.simulate(uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.seed": seed}))
 
 
 def numbers(text):
@@ -121,8 +129,8 @@ def all_at(away_m):
     """Return a planting in which all tags stand at one distance from each other."""
 
     def plant(flight, _):
-        known = calib.Ranges.from_exchanges(flight.exchanges, poses=flight.poses, tags=flight.tags).truth_m
-        return planted.changed(planted.longer(flight, away_m - known), truth_m=np.full(len(known), away_m))
+        truth_m = np.full(len(flight.exchanges), away_m)
+        return planted.changed(planted.longer(flight, truth_m - true_m(flight)), truth_m=truth_m)
 
     return plant
 
@@ -267,28 +275,22 @@ def test_recordings_of_scenarios_without_a_fault_have_no_finding():
 
 
 def test_the_remedy_for_rotated_attitudes_is_the_inverse_rotation():
-    flight, rng = fly(SHORT, 3), RNG(5)
-    turned = planted.turned_attitudes(flight, rng)
-    found = only(turned, "attitudes in another frame")
-    factor = numbers(found.remedy)[-4:]
-    given = Rotation.from_quat(turned.poses.quaternion)
-    mended = (Rotation.from_quat(factor) * given).as_quat()
-    back = replace(turned, poses=replace(turned.poses, quaternion=mended))
-    assert faults(back) == []
+    flight = fly(SHORT, 3)
+    turned = planted.turned_attitudes(flight, RNG(5))
+    factor = numbers(only(turned, "attitudes in another frame").remedy)[-4:]
+    mended = Rotation.from_quat(factor) * Rotation.from_quat(turned.poses.quaternion)
+    assert faults(replace(turned, poses=replace(turned.poses, quaternion=mended.as_quat()))) == []
     # The planted rotation, within 10 degrees: a lever arm of 0.2 m is then 3.5 cm off.
     true = Rotation.from_quat(flight.poses.quaternion)
-    assert np.degrees((Rotation.from_quat(mended) * true.inv()).magnitude()).max() < 10
+    assert np.degrees((mended * true.inv()).magnitude()).max() < 10
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_poses_that_repeat_because_the_body_stands_still_are_sound(seed):
     flight = fly(replace(SHORT, share=0.1, lasts_s=4.0), seed)
     frozen = planted.frozen_poses(flight, RNG(seed), bodies=1)
-    here, there = (
-        calib.Ranges.from_exchanges(one.exchanges, poses=one.poses, tags=one.tags).truth_m for one in (frozen, flight)
-    )
     assert "frozen poses" in faults(frozen)
-    assert "frozen poses" not in faults(planted.longer(frozen, here - there))
+    assert "frozen poses" not in faults(planted.longer(frozen, true_m(frozen) - true_m(flight)))
     # The remedy: poses that repeat the previous one are deleted.
     poses = frozen.poses
     kept = [
@@ -388,54 +390,46 @@ def test_exchanged_anchors_are_one_finding_with_the_corrected_lines(given, count
 
 def test_tags_of_two_robots_that_were_exchanged_are_named_with_body_and_lever_arm():
     flight = fly(SHORT, 97)
-    other = {10: 21, 21: 10}
-    by_number = {tag.tag: tag for tag in flight.tags}
-    found = only(
-        replace(flight, tags=[replace(by_number[other.get(k, k)], tag=k) for k in by_number]), "swapped tag ids"
-    )
+    other, by_number = {10: 21, 21: 10}, {tag.tag: tag for tag in flight.tags}
+    tags = [replace(by_number[other.get(k, k)], tag=k) for k in by_number]
+    found = only(replace(flight, tags=tags), "swapped tag ids")
     assert "tag 10 is at the given position of 21, 21 is at the given position of 10" in found.evidence
-    rows = lines_of(found)["tags"]
-    assert [(row["id"], row["body"], tuple(row["lever_arm_m"])) for row in rows] == [
-        (k, by_number[k].body, by_number[k].lever_arm_m) for k in other
-    ]
+    told = [(row["id"], row["body"], tuple(row["lever_arm_m"])) for row in lines_of(found)["tags"]]
+    assert told == [(k, by_number[k].body, by_number[k].lever_arm_m) for k in other]
 
 
 def test_positions_that_contradict_true_distances_are_named():
     flight = fly(replace(RIG, seconds=60), 97)
-    truth_m = calib.Ranges.from_exchanges(flight.exchanges, poses=flight.poses, tags=flight.tags).truth_m
-    assert faults(planted.changed(flight, truth_m=truth_m + 0.01)) == ["too few pairs"]
+    assert faults(planted.changed(flight, truth_m=true_m(flight) + 0.01)) == ["too few pairs"]
     wrong = planted.exchanged_anchors(flight, RNG(5), given=False)
-    found = only(planted.changed(wrong, truth_m=truth_m + 0.01), "swapped tag ids")
+    found = only(planted.changed(wrong, truth_m=true_m(flight) + 0.01), "swapped tag ids")
     assert found.evidence.startswith("by the poses, tag 101 is at the given position of 103")
 
 
 def test_true_distances_of_the_poses_hold_in_the_middle_of_long_exchanges():
-    flight, reply = fly(replace(RIG, seconds=60), 97), 50e-3 / 15.65e-12
+    flight, reply = fly(replace(RIG, seconds=60), 97), int(50e-3 / 15.65e-12)
     e = flight.exchanges
     # Within 25 ms distances change by centimetres.
-    columns = {"protocol": np.full(len(e), "ss"), "tx2": e.tx2 + int(reply), "rx2": e.rx2 + int(reply)}
-    wrong = planted.exchanged_anchors(planted.changed(flight, **columns), RNG(5), given=False)
-    truth_m = calib.Ranges.from_exchanges(wrong.exchanges, poses=wrong.poses, tags=wrong.tags).truth_m
-    found = only(planted.changed(wrong, truth_m=truth_m), "anchor stands elsewhere")
+    longer = planted.changed(flight, protocol=np.full(len(e), "ss"), tx2=e.tx2 + reply, rx2=e.rx2 + reply)
+    wrong = planted.exchanged_anchors(longer, RNG(5), given=False)
+    found = only(planted.changed(wrong, truth_m=true_m(wrong)), "anchor stands elsewhere")
     assert found.evidence.startswith("ranges with anchor1 fit a position")  # not "by the poses, ..."
 
 
 def test_recordings_of_the_same_time_can_be_examined(tmp_path):
     later = 1_700_000_000 * 10**9  # host times, as of two parts of one session
-    files = [tmp_path / "a.uwb", tmp_path / "b.uwb"]
-    for file, seed in zip(files, (98, 99), strict=True):
+    for seed in (98, 99):
         one = fly(replace(SHORT, bodies=3, anchors=4, seconds=60), seed)
         e = replace(one.exchanges, time_ns=one.exchanges.time_ns + later)
         poses = replace(one.poses, time_ns=one.poses.time_ns + later)
-        Contents(exchanges=e, poses=poses, tags=one.tags).save(file)
-    assert "nothing found" in succeed("calib", "doctor", *files).stdout
+        Contents(exchanges=e, poses=poses, tags=one.tags).save(tmp_path / f"{seed}.uwb")
+    assert "nothing found" in succeed("calib", "doctor", *tmp_path.iterdir()).stdout
 
 
 def test_true_distances_of_a_displaced_anchor_are_named():
     flight = fly(replace(RIG, seconds=60), 97)
     wrong = with_places(flight, {"anchor2": [3.0, -4.0, 1.0]})
-    truth_m = calib.Ranges.from_exchanges(wrong.exchanges, poses=wrong.poses, tags=wrong.tags).truth_m
-    found = calib.examine(replace(planted.changed(flight, truth_m=truth_m), poses=flight.poses[:0]))
+    found = calib.examine(replace(planted.changed(flight, truth_m=true_m(wrong)), poses=flight.poses[:0]))
     assert [one.fault for one in found] == ["ranges that do not follow the distances", "too few pairs"]
     assert sorted(re.findall(r"\d+-\d+", found[0].evidence)) == ["10-102", "11-102"]
 
@@ -463,7 +457,7 @@ def test_findings_state_positions_of_anchors_with_intervals_and_as_map_lines():
 def test_ranges_between_anchors_determine_their_positions():
     """The moving tags determine the direction of an anchor's displacement only to 19 cm."""
 
-    flight = uwbsim.simulate(uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.seed": 77_001}))
+    flight = anchors_and_tag(77_001)
     true, off = np.array([-2.96, 0.61, 1.66]), np.array([0.2, 0.1, 0.1])
     found = only(with_places(flight, {"anchor4": true + off}), "anchor stands elsewhere")
     axes = np.array(re.findall(r"([-+][\d.]+) ± ([\d.]+)", found.evidence), dtype=float)
@@ -476,7 +470,7 @@ def test_ranges_between_anchors_determine_their_positions():
 @pytest.mark.parametrize("seed", [77_010, 77_012])
 def test_displaced_anchors_are_not_taken_for_walls(seed):
 
-    flight = uwbsim.simulate(uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.seed": seed}))
+    flight = anchors_and_tag(seed)
     off = planted.all_anchors_off(flight, RNG(seed))
     (found,) = calib.examine(off)
     assert found.fault == "places that do not close"
@@ -495,7 +489,7 @@ def test_displaced_anchors_are_not_taken_for_walls(seed):
 @pytest.mark.parametrize(("seed", "pair", "either"), [(77_010, (0, 1), True), (77_012, (2, 4), False)])
 def test_walls_between_anchors_and_displaced_anchors_are_distinguished(seed, pair, either):
 
-    flight = uwbsim.simulate(uwbsim.load("anchors_and_tag/anchors_and_tag", {"run.seed": seed}))
+    flight = anchors_and_tag(seed)
     wall = longer(0.2, lambda f: planted.of_tag(f, pair[0]) & planted.of_tag(f, pair[1]))
     (found,) = calib.examine(wall(flight, None))
     assert found.fault == "pairs that do not close"
@@ -538,10 +532,10 @@ def test_an_anchor_whose_delay_changed_between_sessions_is_named(gap):
 
 def test_boards_at_one_distance_have_a_finding_on_the_unit():
     flight = fly(SHORT, 98)
-    e = flight.exchanges[(flight.exchanges.initiator == 10) & (flight.exchanges.target == 20)]
-    known = calib.Ranges.from_exchanges(e, poses=flight.poses, tags=flight.tags).truth_m
-    near = planted.longer(replace(flight, exchanges=e), 3.0 - known)
-    (found,) = calib.examine(replace(planted.changed(near, truth_m=np.full(len(e), 3000.0)), poses=flight.poses[:0]))
+    near = some(lambda e: (e.initiator == 10) & (e.target == 20))(flight, None)
+    near = planted.longer(near, 3.0 - true_m(near))
+    truth_m = np.full(len(near.exchanges), 3000.0)
+    (found,) = calib.examine(replace(planted.changed(near, truth_m=truth_m), poses=flight.poses[:0]))
     assert found.fault == "unit of the true distances"
     assert 'distance = "mm"' in found.remedy
 
