@@ -88,27 +88,23 @@ def bound_ns2(pairs, tags, *, count=1500, noise_ns=0.15, listening=True):
 def least_squares_ns(data, tags=6):
     """Return the delays (tags,) in ns by generalised least squares from the stamps of a whole flight."""
     e, h = data.exchanges, data.overheard
-    place = {body: data.poses.position_m[data.poses.body == body][0] for body in {tag.body for tag in data.tags}}
-    at = np.array([place[f"mast {k}"] for k in range(tags)])
+    at = np.array([data.poses.position_m[data.poses.body == f"mast {k}"][0] for k in range(tags)])
     far_s = np.linalg.norm(at[:, None] - at[None], axis=2) / C
 
     def span(later, earlier):
         return ((later - earlier) & (2**32 - 1)) * TICK
 
-    i, j, n = e.initiator, e.target, len(e)
+    i, j, k, row = e.initiator, e.target, h["listener"], np.searchsorted(e.time_ns, h["time_ns"])
     ratio = span(e.rx3, e.rx2) / span(e.tx3, e.tx2)
     error = (span(e.rx2, e.tx1) - ratio * span(e.tx2, e.rx1)) / 2 - far_s[i, j]
-    heard = np.zeros((n, tags))
-    row = np.searchsorted(e.time_ns, h["time_ns"])
     rate = span(h["tx3_n"], h["tx2_n"]) / span(h["rx3"], h["rx2"])
     late = rate * span(h["rx2"], h["rx1"]) - span(h["tx2_n"], h["rx1_n"])
-    k = h["listener"]
+    heard = np.zeros((len(e), tags))
     heard[row, k] = late - (far_s[i[row], j[row]] + far_s[j[row], k] - far_s[i[row], k])
     known, pulled = np.zeros((tags, tags)), np.zeros(tags)
-    for one in range(n):
-        errors, slopes = _rows(i[one], j[one], tags)
-        others = [k for k in range(tags) if k not in (i[one], j[one])]
+    for one, (first, second) in enumerate(zip(i, j, strict=True)):
+        errors, slopes = _rows(first, second, tags)
         weighed = np.linalg.solve(errors @ errors.T, slopes)
         known += weighed.T @ slopes
-        pulled += weighed.T @ np.append(error[one], heard[one, others])
+        pulled += weighed.T @ np.append(error[one], np.delete(heard[one], [first, second]))
     return 1e9 * np.linalg.solve(known, pulled)

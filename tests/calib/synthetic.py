@@ -70,3 +70,9 @@ def about_their_mean(known: Calibration, planted: dict[int, float]):
     centre = np.eye(len(planted)) - 1 / len(planted)
     error = centre @ [known.delays_ns[tag] - delay for tag, delay in planted.items()]
     return error, np.sqrt(np.diag(centre @ known.covariance_ns2(list(planted)) @ centre))
+
+
+def track_errors(track, after_s=0.0):
+    """Return distances (n,) in metres between estimated and true positions from some seconds after the start on."""
+    late = track.time_ns >= track.time_ns[0] + int(after_s * 1e9)
+    return np.linalg.norm((track.estimate_m - track.truth_m)[late], axis=1)

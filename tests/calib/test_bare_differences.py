@@ -7,7 +7,6 @@ difference of its distances to two anchors.
 import json
 import re
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,21 +35,23 @@ def flown(seed, seconds, *, reflected=0.05):
     """
     random = np.random.default_rng(seed)
     time_s = np.arange(0, seconds, 1 / 160)
-    first = np.arange(len(time_s)) % 8
-    second = (first + 1 + np.arange(len(time_s)) // 8 % 7) % 8
+    row = np.arange(len(time_s))
+    first, second = row % 8, (row + 1 + row // 8 % 7) % 8
     to_first, to_second = (np.linalg.norm(ANCHORS[k] - place_m(time_s), axis=1) for k in (first, second))
-    difference = to_second - to_first + NOISE_M * random.normal(size=len(time_s))
-    difference -= METRES_A_NS * (DELAYS_NS[second] - DELAYS_NS[first]) / 2
-    late = random.exponential(0.5, len(time_s)) * random.choice([-1, 1], len(time_s))
-    difference += np.where(random.random(len(time_s)) < reflected, late, 0.0)
-    return time_s, first + 1, second + 1, difference
+    noise = NOISE_M * random.normal(size=len(row)) - METRES_A_NS * (DELAYS_NS[second] - DELAYS_NS[first]) / 2
+    late = random.exponential(0.5, len(row)) * random.choice([-1, 1], len(row))
+    late *= random.random(len(row)) < reflected
+    return time_s, first + 1, second + 1, to_second - to_first + noise + late
 
 
-def write(folder, rows, header="time_s,tag,anchor_a,anchor_b,difference_m"):
-    """Write a table of differences, poses of the tag and positions of the anchors."""
-    time_s, first, second, difference = rows
-    lines = [f"{t:.6f},{TAG},{a},{b},{d:.12g}" for t, a, b, d in zip(time_s, first, second, difference, strict=True)]
-    (folder / "d.csv").write_text("\n".join([header, *lines, ""]))
+def imported(folder, rows, *, swapped=False, mocap=True):
+    """Return the path of a recording of a flight, from a table of differences, poses of the tag and positions of the
+    anchors; `swapped` by a map with the other sign.
+    """
+    folder.mkdir(exist_ok=True)
+    time_s = rows[0]
+    lines = [f"{t:.6f},{TAG},{a},{b},{d:.12g}" for t, a, b, d in zip(*rows, strict=True)]
+    (folder / "d.csv").write_text("\n".join(["time_s,tag,anchor_a,anchor_b,difference_m", *lines, ""]))
     around = np.arange(time_s[0] - 0.5, time_s[-1] + 0.5, 0.01)
     poses = [
         f"{t:.6f},tag20,{x:.6f},{y:.6f},{z:.6f},0,0,0,1" for t, (x, y, z) in zip(around, place_m(around), strict=True)
@@ -59,19 +60,16 @@ def write(folder, rows, header="time_s,tag,anchor_a,anchor_b,difference_m"):
     places = [f"[[anchors]]\nid = {k}\nposition_m = {at.tolist()}\n" for k, at in enumerate(ANCHORS, 1)]
     (folder / "tags.toml").write_text(f'[[tags]]\nid = {TAG}\nbody = "tag20"\n{"".join(places)}')
 
+    def run(words):
+        processes.succeed("uwblink", *words.split(), cwd=folder)
 
-def imported(folder, rows, *, swapped=False, mocap=True):
-    """Return the path of a recording of a flight; `swapped` by a map with the other sign."""
-    folder.mkdir(exist_ok=True)
-    write(folder, rows)
-    processes.succeed("uwblink", "import", "guess", "d.csv", "-o", "map.toml", cwd=folder)
+    run("import guess d.csv -o map.toml")
     if swapped:
         text = (folder / "map.toml").read_text()
-        text = text.replace("anchor_a", "x").replace("anchor_b", "anchor_a").replace('"x"', '"anchor_b"')
-        (folder / "map.toml").write_text(text)
-    processes.succeed("uwblink", "import", "csv", "d.csv", "-o", "d.uwb", "--map", "map.toml", cwd=folder)
-    words = ["uwblink", "poses", "d.uwb", "--tags", "tags.toml", *(["--from", "poses.csv"] if mocap else [])]
-    processes.succeed(*words, cwd=folder)
+        other = {"anchor_a": "anchor_b", "anchor_b": "anchor_a"}
+        (folder / "map.toml").write_text(re.sub("anchor_[ab]", lambda name: other[name[0]], text))
+    run("import csv d.csv -o d.uwb --map map.toml")
+    run(f"poses d.uwb --tags tags.toml {'--from poses.csv' if mocap else ''}")
     return folder / "d.uwb"
 
 
@@ -94,14 +92,13 @@ def fly(folder):
 
 def test_differences_determine_delays_minus_their_mean(folder):
     known = calib.load_calibration(folder / "fit.json")
-    found = np.array([known.delays_ns[tag] for tag in range(1, 9)])
-    std = np.array([known.std_of_sum_ns([tag]) for tag in range(1, 9)])
+    found, std = np.array([(known.delays_ns[tag], known.std_of_sum_ns([tag])) for tag in range(1, 9)]).T
     # Each anchor is in a quarter of 9600 rows, with half of its delay: 0.1 m/sqrt(2400)/0.15 m/ns = 0.0136 ns; the
     # delays of partners, the loss and 5 % of reflections increase this by at most a half.
     assert np.all((std > 0.012) & (std < 0.022))
-    wrong = found - (DELAYS_NS - DELAYS_NS.mean())
-    assert np.all(np.abs(wrong) < 4 * std)
-    assert np.sqrt(np.mean((wrong / std) ** 2)) < 1.8, "99.9 % of the roots of chi-square over seven"
+    scores = (found - (DELAYS_NS - DELAYS_NS.mean())) / std
+    assert np.all(np.abs(scores) < 4)
+    assert np.sqrt(np.mean(scores**2)) < 1.8, "99.9 % of the roots of chi-square over seven"
     assert (set(known.delays_std_ns.values()), known.undetermined_splits) == ({np.inf}, (((), tuple(range(1, 9))),))
     # The noise is that of a difference.
     assert known.sigma_curve(np.ones(1))[0] == pytest.approx(NOISE_M, rel=0.05)
@@ -114,8 +111,10 @@ def test_the_fit_names_undetermined_delays(folder):
     assert re.search(r"(?s)only differences of arrival from tags 1, 2, 3.*a common shift of", warned)
     pinned = calib.fit(folder / "fit/d.uwb", use="receptions", delays_only=True, fixed_ns={1: DELAYS_NS[0]}).calibration
     assert not pinned.undetermined_splits
-    for tag in range(2, 9):
-        assert abs(pinned.delays_ns[tag] - DELAYS_NS[tag - 1]) < 4 * pinned.delays_std_ns[tag] < 0.13
+    error = np.array([pinned.delays_ns[tag] for tag in range(2, 9)]) - DELAYS_NS[1:]
+    reach = 4 * np.array([pinned.delays_std_ns[tag] for tag in range(2, 9)])
+    assert np.all(np.abs(error) < reach)
+    assert reach.max() < 0.13
 
 
 def test_differences_are_shown_and_not_streamed(folder):
@@ -142,26 +141,26 @@ def test_undetermined_differences_are_not_corrected(folder):
 
 @pytest.mark.slow
 def test_a_tag_is_localized_by_differences(folder):
-    words = ["calib", "localize", "fly/d.uwb", "-c", "fit.json", "--use", "receptions", "--seeds", "1", "--json"]
-    (one,) = json.loads(processes.succeed(*words, cwd=folder).stdout)["scenarios"]
+    words = "calib localize fly/d.uwb -c fit.json --use receptions --seeds 1 --json"
+    (one,) = json.loads(processes.succeed(*words.split(), cwd=folder).stdout)["scenarios"]
     assert one["arrivals"] == 3200
     assert one["rmse_m"]["robust"] < 0.04
     assert one["rmse_m"]["variance"] < 0.045 < 0.08 < one["rmse_m"]["raw"]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["constant-velocity", "imu"])
-def test_the_tag_is_tracked_on_board(folder, fly, model):
-    time_s = np.arange(0, 20.0, 0.01)
-    swing = np.column_stack([2.5 * np.sin(0.5 * time_s), 2.2 * np.cos(0.37 * time_s), 0.7 * np.sin(0.29 * time_s)])
-    force = -(np.array([0.5, 0.37, 0.29]) ** 2) * swing + [0.0, 0.0, 9.80665]
-    columns = dict(zip(("ax", "ay", "az"), force.T, strict=True)) | dict.fromkeys(("wx", "wy", "wz"), np.zeros(2000))
+@pytest.mark.parametrize(("model", "used", "most_m"), [("constant-velocity", "", 0.1), ("imu", ", imu", 0.06)])
+def test_the_tag_is_tracked_on_board(folder, fly, model, used, most_m):
+    time_s, step_s = np.arange(0, 20.0, 0.01), 1e-3
+    bend = (place_m(time_s + step_s) - 2 * place_m(time_s) + place_m(time_s - step_s)) / step_s**2
+    columns = dict(zip(("ax", "ay", "az"), (bend + np.array([0.0, 0.0, 9.80665])).T, strict=True))
     imu = {"time_ns": np.rint(time_s * 1e9).astype(np.int64), "body": np.full(2000, "tag20"), **columns}
+    imu |= dict.fromkeys(("wx", "wy", "wz"), np.zeros(2000))
     settings = calib.OnboardSettings(model=model, use="receptions")
     (found,) = calib.localize_onboard(replace(fly.select(stop_s=6.0), imu=imu), folder / "fit.json", settings)
-    assert found.used == "differences of arrival" + (", imu" if model == "imu" else "")
+    assert found.used == f"differences of arrival{used}"
     assert not found.restarts_s
-    assert found.rmse_m < {"constant-velocity": 0.1, "imu": 0.06}[model]
+    assert found.rmse_m < most_m
 
 
 @pytest.mark.slow
@@ -183,16 +182,18 @@ def test_a_calibration_of_ranges_corrects_differences(folder):
     assert total.nees == pytest.approx(3.0, abs=0.9)
 
 
+@pytest.fixture(scope="module")
+def swapped(folder):
+    return imported(folder / "swapped", flown(3, 8.0), swapped=True).parent
+
+
 @pytest.mark.parametrize(
     "words", [("fit", "-o", "x.json", *FIT), ("localize", "-c", "../fit.json", "--use", "receptions")]
 )
-def test_the_wrong_sign_is_detected_with_poses(folder, words):
-    if not (folder / "swapped").exists():
-        imported(folder / "swapped", flown(3, 8.0), swapped=True)
-    command, *others = words
+def test_the_wrong_sign_is_detected_with_poses(swapped, words):
     naming = ["d.uwb", "the wrong sign", "from_id", "to_id"]
-    processes.refuse("calib", command, "d.uwb", *others, cwd=folder / "swapped", naming=naming, status=2)
-    assert not (folder / "swapped" / "x.json").exists()
+    processes.refuse("calib", words[0], "d.uwb", *words[1:], cwd=swapped, naming=naming)
+    assert not (swapped / "x.json").exists()
 
 
 @pytest.mark.parametrize(
@@ -218,9 +219,8 @@ def test_another_unit_or_sign_is_found_before_a_fit(fly, factor, blind, words):
 def test_numbers_that_are_no_differences_are_left_out_and_counted(fly):
     other = fly.differences["difference_m"].copy()
     other[::50] = np.resize([1e300, -1e300, np.nan], len(other[::50]))
-    found = calib.load_ranges(
-        replace(fly, differences={**fly.differences, "difference_m": other}), need_power=False, use="receptions"
-    )
+    changed = replace(fly, differences={**fly.differences, "difference_m": other})
+    found = calib.load_ranges(changed, need_power=False, use="receptions")
     assert found.excluded["no range within 10 km"] == 64
 
 
@@ -268,17 +268,12 @@ def test_an_anchor_without_a_place_or_with_itself_is_named(folder, fly, words, p
 def test_ranges_and_differences_are_used_together_and_fitted_apart(folder, fly):
     time_s = np.arange(0.1, 19.0, 0.1)
     truth = np.linalg.norm(ANCHORS[0] - place_m(time_s), axis=1)
-    none: Any = dict.fromkeys(("tx1", "rx1", "tx2", "rx2"), np.zeros(len(time_s), dtype=np.int64))
-    when_ns = np.rint(time_s * 1e9).astype(np.int64)
-    ranges = uwblink.Exchanges.from_arrays(TAG, 1, time_ns=when_ns, protocol="ss", range_m=truth, **none)
+    ranges = uwblink.Exchanges.from_arrays(TAG, 1, time_ns=np.rint(time_s * 1e9).astype(np.int64), range_m=truth)
     both = replace(fly, exchanges=ranges)
     with pytest.raises(calib.CalibError, match="fit them separately"):
         calib.fit(both, use="receptions", delays_only=True)
-    known = replace(
-        calib.load_calibration(folder / "fit.json"),
-        delays_ns=dict(zip((*range(1, 9), TAG), (*DELAYS_NS, -DELAYS_NS[0]), strict=True)),
-        undetermined_splits=(),
-    )
+    delays_ns = dict(zip((*range(1, 9), TAG), (*DELAYS_NS, -DELAYS_NS[0]), strict=True))
+    known = replace(calib.load_calibration(folder / "fit.json"), delays_ns=delays_ns, undetermined_splits=())
     (found,) = calib.localize(both, known, Settings(use="receptions"))
     both.save(folder / "both.uwb", force=True)
     with pytest.warns(calib.errors.LeftOutWarning, match="3200 differences of arrival"):

@@ -1,7 +1,10 @@
 """The front door of calib: its names, the cost of importing it, and its examples."""
 
 import doctest
+from contextlib import suppress
 from dataclasses import replace
+from functools import cache
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -9,6 +12,8 @@ import pytest
 from matplotlib.figure import Figure
 
 import calib
+import uwbsim
+from benchmarks.directions import Recipe, flight
 from calib.calibration.power_curves import Curve
 from calib.estimator.losses import LOSSES
 from calib.figures import binned, cumulative, curve_over_power, delays, histogram, within_fence
@@ -44,25 +49,28 @@ def test_public_results_print_on_a_screen():
         assert max(map(len, text.splitlines())) <= 120, type(thing)
 
 
-def test_other_objects_than_calibrations_are_refused(tmp_path):
+@pytest.mark.parametrize("wrong", [None, 3, {}], ids=str)
+@pytest.mark.parametrize(
+    ("call", "parameter"),
+    [
+        (lambda wrong, _: calib.evaluate(calib.sample_flight(), wrong), "calibration"),
+        (lambda wrong, _: calib.localize(calib.sample_flight(), wrong), "calibration"),
+        (lambda wrong, _: calib.export(wrong, "csv"), "calibration"),
+        (lambda wrong, _: calib.compare(calib.fit(calib.sample_flight(300)), wrong), "second"),
+        (lambda wrong, folder: calib.apply(folder / "f.uwb", wrong, folder / "g.uwb"), "calibration"),
+        (lambda wrong, folder: calib.write_report(folder / "r.html", calib.sample_flight(), wrong), "calibration"),
+    ],
+    ids=["evaluate", "localize", "export", "compare", "apply", "write_report"],
+)
+def test_other_objects_than_calibrations_are_refused(tmp_path, call, parameter, wrong):
+    with pytest.raises(calib.BadInputError, match=f"^`{parameter}`.*expected a Calibration"):
+        call(wrong, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_results_and_paths_are_accepted_like_calibrations(tmp_path):
     flight = calib.sample_flight()
     result = calib.fit(flight)
-    calls: dict[str, Any] = {
-        "evaluate": lambda wrong: calib.evaluate(flight, wrong),
-        "localize": lambda wrong: calib.localize(flight, wrong),
-        "export": lambda wrong: calib.export(wrong, "csv"),
-        "compare": lambda wrong: calib.compare(result.calibration, wrong),
-        "apply": lambda wrong: calib.apply(tmp_path / "f.uwb", wrong, tmp_path / "g.uwb"),
-        "write_report": lambda wrong: calib.write_report(tmp_path / "r.html", flight, wrong),
-    }
-    no_calibrations: tuple[Any, ...] = (None, 3, {})
-    for wrong in no_calibrations:
-        for name, call in calls.items():
-            with pytest.raises(calib.BadInputError, match="expected a Calibration") as caught:
-                call(wrong)
-            assert caught.value.parameter == ("second" if name == "compare" else "calibration")
-    assert list(tmp_path.iterdir()) == []
-    # A result and the path of a calibration are accepted like the calibration.
     result.save(tmp_path / "c.json")
     with pytest.raises(FileExistsError):
         result.save(tmp_path / "c.json")
@@ -84,9 +92,8 @@ def fitted():
 
 def axes_of(draw):
     with figures.style():
-        figure = Figure(figsize=(7.16, 3), layout="constrained")
-        axes = draw(figure.subplots())
-        figure.draw_without_rendering()
+        axes = draw(Figure(figsize=(7.16, 3), layout="constrained").subplots())
+        axes.figure.draw_without_rendering()
     return axes
 
 
@@ -100,19 +107,10 @@ def points_and_curve(axes):
     return points, np.interp(points.get_xdata(), curve.get_xdata(), curve.get_ydata())
 
 
-def test_points_are_the_core_and_medians_lie_above():
-    # Planted: a core of 5 cm about zero, a fifth of it lengthened by 40 cm on average.
-    rng = np.random.default_rng(5)
-    error = rng.normal(0, 0.05, 40_000) + np.where(rng.random(40_000) < 0.2, rng.exponential(0.4, 40_000), 0)
-    everything = {"": (np.arange(40_000), 20)}
-    found = binned(rng.uniform(0, 1.5, 40_000), error, everything, "mixture")[""]
-    # 2000 ranges in a bin determine the centre to 1.5 mm, and the spread, estimated with the tail, to 2 mm.
-    assert np.abs(found.centre_m).max() < 0.006
-    assert np.abs(found.centre_m.mean()) < 0.001
-    assert found.std_m == pytest.approx(0.05, abs=0.008)
-    assert found.median_m.mean() == pytest.approx(0.0145, abs=0.003)
-    squares = binned(np.arange(40_000.0), error, everything, "l2")[""]
-    assert squares.centre_m.mean() == pytest.approx(error.mean(), abs=1e-9)
+def test_points_of_least_squares_are_means():
+    error = np.random.default_rng(5).exponential(0.4, 40_000)
+    found = binned(np.arange(40_000.0), error, {"": (np.arange(40_000), 20)}, "l2")[""]
+    assert found.centre_m.mean() == pytest.approx(error.mean(), abs=1e-9)
 
 
 def test_the_drawn_curve_goes_through_the_drawn_points(fitted):
@@ -125,25 +123,24 @@ def test_the_drawn_curve_goes_through_the_drawn_points(fitted):
     away = points.get_ydata() - (100 * bias_m(points.get_xdata()))
     assert np.abs(away - away.mean()).max() < 1.2, "and both follow what was planted"
     (top,) = axes.child_axes  # first-path powers in dBm
-    for place, text in zip(top.get_xticks(), top.get_xticklabels(), strict=True):
-        assert 10 ** ((float(text.get_text().replace("−", "-")) + 82) / 10) == pytest.approx(place)
+    dbm = np.array([float(text.get_text().replace("−", "-")) for text in top.get_xticklabels()])
+    assert 10 ** ((dbm + 82) / 10) == pytest.approx(top.get_xticks())
 
 
-def test_curves_with_few_points_are_drawn_completely(fitted):
-    faint = fitted.ranges[fitted.ranges.fpp1_dbm < np.median(fitted.ranges.fpp1_dbm)]
-    known = fitted.calibration
-    axes = axes_of(lambda a: curve_over_power(faint, known.apply(faint), known, "bias", a))
-    (low, high), drawn = axes.get_ylim(), labelled(axes, "fitted").get_ydata()
-    assert low < drawn.min() < drawn.max() < high
+def test_curves_with_few_points_are_drawn_completely_or_where_the_ranges_are(fitted):
+    power, known = fitted.ranges.fpp1_dbm, fitted.calibration
 
+    def drawn(quantile, known):
+        faint = fitted.ranges[power < np.quantile(power, quantile)]
+        return faint, axes_of(lambda a: curve_over_power(faint, known.apply(faint), known, "bias", a))
 
-def test_a_curve_is_drawn_where_the_ranges_are_if_it_is_flat_elsewhere(fitted):
-    known = fitted.calibration
+    _, axes = drawn(0.5, known)
+    (low, high), curve = axes.get_ylim(), labelled(axes, "fitted").get_ydata()
+    assert low < curve.min() < curve.max() < high
+    # Far outside of its points it would flatten the figure.
     steep = Curve((0.0,) * 4 + (0.5, 1.0) + (15.0,) * 4, (-0.2, -0.18, 0.04, 0.04, 0.04, 0.04), 3, (0.0, 15.0))
-    faint = fitted.ranges[fitted.ranges.fpp1_dbm < np.quantile(fitted.ranges.fpp1_dbm, 0.3)]
-    changed = replace(known, bias_curve=steep, uncertainty=None)
-    low, high = axes_of(lambda a: curve_over_power(faint, changed.apply(faint), changed, "bias", a)).get_ylim()
-    of_ranges = 100 * steep(changed.lifted(faint))
+    faint, axes = drawn(0.3, replace(known, bias_curve=steep, uncertainty=None))
+    (low, high), of_ranges = axes.get_ylim(), 100 * steep(known.lifted(faint))
     assert np.mean((of_ranges > low) & (of_ranges < high)) > 0.9
 
 
@@ -177,9 +174,8 @@ def test_a_histogram_shows_corrected_errors_whatever_raw_ones_are(fitted, offset
 def test_the_distribution_shows_shares_of_smaller_errors(fitted):
     applied = fitted.calibration.apply(fitted.ranges)
     line = labelled(axes_of(lambda a: cumulative(fitted.ranges, applied, a)), "fully corrected")
-    size = 100 * np.abs(applied.corrected_m - fitted.ranges.truth_m)
-    for x, y in zip(line.get_xdata()[::20], line.get_ydata()[::20], strict=True):
-        assert 100 * np.mean(size <= x) == pytest.approx(y, abs=0.1)
+    size, (x, y) = 100 * np.abs(applied.corrected_m - fitted.ranges.truth_m), line.get_data()
+    assert 100 * np.mean(size[:, None] <= x, axis=0) == pytest.approx(y, abs=0.1)
 
 
 def test_undetermined_delays_are_drawn_as_circles(fitted):
@@ -195,3 +191,61 @@ def test_undetermined_delays_are_drawn_as_circles(fitted):
 def test_planted_delays_are_drawn_moved_by_the_common_shift(fitted):
     axes = axes_of(lambda axes: delays(fitted.calibration, {1: 0.1, 2: -0.2, 3: 0.0, 7: 0.3}, 0.05, axes))
     assert labelled(axes, "planted, same gauge").get_ydata() == pytest.approx([0.15, -0.15, 0.05, 0.35])
+
+
+# Combinations of settings of a fit, over recordings of different kinds: each gives a calibration or a reason.
+
+
+FLIGHTS = {
+    "three robots": ["icra2023/train"],
+    "two flights": ["icra2023/train", "icra2023/test1"],
+    "anchors that do not range": ["anchors_and_tag/bipartite"],
+    "anchors beside another flight": ["anchors_and_tag/anchors_and_tag", "icra2023/train"],
+    "boards that warm up": ["warm_up/warm_up"],
+    "without noise": ["noiseless"],
+    "patterns": [],
+}
+SETTINGS: dict[str, tuple[Any, ...]] = {
+    "loss": ("mixture", "cauchy", "huber"),
+    "lift": ("mean-of-lifted", "lift-of-mean"),
+    "constants": ("pair",),
+    "use": ("receptions",),
+    "pattern": ("none", "shared", "tag"),
+    "temperature": ("none", "shared", "tag"),
+    "sequential": (True,),
+    "delays_only": (True,),
+    "scale_ns": (0.001, 10.0),
+    "between_m": (0.0, 0.5),
+    "reference_power_dbm": (-120.0, -60.0),
+    "hold_out": (0.1, 0.9),
+    "fixed_ns": ({1: 0.1}, {1: 0.1, 4: 0.0}, dict.fromkeys((1, 2, 3, 4, 5, 6), 0.0)),
+    "groups": ({"some": (1, 2, 3)}, {"some": (1, 2), "others": (4, 5)}),
+}
+CHANGES = [(name, value) for name, values in SETTINGS.items() for value in values]
+
+
+@cache
+def flown(name):
+    found = [uwbsim.simulate(uwbsim.load(one, {"run.duration_s": 15.0})) for one in FLIGHTS[name]]
+    return found or [flight(Recipe(seconds=20), 1)[0]]
+
+
+@cache
+def another():
+    return calib.fit(flown("three robots")).calibration
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FLIGHTS)
+def test_each_setting_alone_and_pairs_of_settings_are_fitted_or_refused(tmp_path, name):
+    # A third of all pairs of settings; each flight has its share of them.
+    own = list(combinations(CHANGES, 2))[list(FLIGHTS).index(name) :: 3 * len(FLIGHTS)]
+    for number, changes in enumerate([*([one] for one in CHANGES), *own]):
+        file = tmp_path / f"{number}.json"
+        with suppress(calib.CalibError):
+            calib.fit(flown(name), **dict(changes)).save(file)
+            known = calib.load_calibration(file)
+            overall = calib.evaluate(flown(name), known).overall
+            assert np.isfinite([*known.delays_ns.values(), overall.full.median_m]).all(), changes
+            calib.compare(known, another())
+            calib.export(known, "registers")

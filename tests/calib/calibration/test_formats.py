@@ -3,6 +3,8 @@
 import csv
 import json
 import math
+import shutil
+import subprocess
 import tomllib
 from dataclasses import replace
 
@@ -11,8 +13,8 @@ import pytest
 
 import calib
 from calib.calibration.formats import programmed, read_miluv, registers
-from calib.calibration.patterns import Pattern
-from tests.calib.c_header import printed
+from calib.calibration.model import TagGroup
+from calib.calibration.patterns import Pattern, TemperatureSlope
 from tests.calib.synthetic import DELAYS_NS, ranges
 from tests.shared_data import miluv, shared
 from uwblink.importers import read_source
@@ -26,10 +28,8 @@ def fitted():
     return calib.fit(ranges()).calibration
 
 
-def test_undetermined_delays_have_no_registers(fitted):
+def test_undetermined_delays_are_exported_where_there_is_a_form_for_them(fitted):
     known = replace(fitted, delays_std_ns={**fitted.delays_std_ns, 2: math.inf, 3: math.inf})
-    with pytest.raises(calib.BadInputError, match=r"`to`: the data do not determine the delay of tag 2, 3"):
-        calib.export(known, "registers")
     assert "inf" in calib.export(known, "csv").splitlines()[2]
     assert "delay_ns" in calib.export(known, "ros-yaml")
 
@@ -50,7 +50,21 @@ def test_registers_add_to_programmed_delays(tmp_path, fitted):
     assert tomllib.loads(text)["antenna_delays"]["tags"]["1"] == found[1]._asdict()
 
 
-MAIN = """
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
+
+
+def printed(folder, known, main, text=""):
+    """Return the output of a program that includes the header of a calibration; skips without a compiler."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("no C compiler on this machine")
+    calib.export(known, "c-header", folder / "calibration.h")
+    (folder / "main.c").write_text(main)
+    subprocess.run([compiler, *STRICT, "main.c", "-o", "main", "-lm"], cwd=folder, check=True)
+    return subprocess.run(["./main"], cwd=folder, input=text, capture_output=True, text=True, check=True).stdout
+
+
+CORRECTING = """
 #include <stdio.h>
 #include "calibration.h"
 int main(void)
@@ -105,10 +119,9 @@ def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
     # With the precision of `Ranges`, both sides have equal numbers; every tenth direction is unknown.
     away = (away / np.linalg.norm(away, axis=2, keepdims=True)).astype(np.float32)
     away.reshape(-1, 3)[::10] = math.nan
-    lines = [f"{r!r} {a!r} {b!r} {i:.0f} {j:.0f}" for r, a, b, i, j in [*rows.tolist(), (1.0, -85.0, -85.0, 9999, one)]]
-    toward = [" ".join(map(str, six)) for six in [*away.reshape(-1, 6).astype(float).tolist(), range(6)]]
-    text = "\n".join(f"{line} {six}" for line, six in zip(lines, toward, strict=True))
-    *found, strange = (line.split() for line in printed(tmp_path, known, MAIN, text).splitlines())
+    table = [*np.hstack([rows, away.reshape(-1, 6)]).tolist(), (1.0, -85.0, -85.0, 9999, one, *range(6))]
+    text = "\n".join(f"{r!r} {a!r} {b!r} {i:.0f} {j:.0f} {' '.join(map(str, six))}" for r, a, b, i, j, *six in table)
+    *found, strange = (line.split() for line in printed(tmp_path, known, CORRECTING, text).splitlines())
     status, values = np.array(found)[:, 0], np.array(found, dtype=float)[:, 1:]
     ends = rows[:, 3:].astype(int)
     undetermined = np.array([sum(known.sides.get(tag, 0) for tag in pair) != 0 for pair in ends.tolist()])
@@ -132,6 +145,36 @@ def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
     assert changed == pytest.approx(0.9 if known.patterns else 0.0, abs=0.15)
 
 
+WARM = """
+#include <stdio.h>
+#include "calibration.h"
+int main(void)
+{
+    const double celsius[][2] = {{30.0, 24.5}, {30.0, NAN}, {NAN, NAN}};
+    double x, unknown, longer;
+    int k;
+    (void)uwb_correct(1, 0, 0, 1, 2, &x, 0);
+    (void)uwb_errors(0, 0, 1, 2, &x, &x, &x);
+    for (k = 0; k < 3; k++) {
+        longer = uwb_warmth(1, 3, celsius[k][0], celsius[k][1], &unknown);
+        printf("%.17g %.17g ", longer, unknown);
+    }
+    return 0;
+}
+"""
+
+
+def test_the_c_header_states_the_effect_of_temperatures(tmp_path, fitted):
+    slopes = (TemperatureSlope((1, 2, 3, 7), 0.005, 0.0002, 27.5, (20.0, 35.0)),)
+    known, expected = replace(fitted, temperatures=slopes), list[float]()
+    plain = fitted.correct(3.0, -85.0, -86.0, 1, 3)
+    for celsius in ((30.0, 24.5), (30.0, np.nan), (np.nan, np.nan)):
+        seen = known.correct(3.0, -85.0, -86.0, 1, 3, temperature_c=celsius)
+        expected += [plain.range_m - seen.range_m, seen.sigma_total_m**2 - plain.sigma_total_m**2]
+    # Temperatures have single precision: 2e-6 K of 30.
+    assert list(map(float, printed(tmp_path, known, WARM).split())) == pytest.approx(expected, abs=1e-8, rel=1e-5)
+
+
 def test_miluv_is_read_and_given_back_unchanged():
     path = shared("miluv_published_calibration.json")
     found = read_miluv(path)
@@ -147,19 +190,20 @@ def test_the_published_calibration_gives_the_published_ranges(tmp_path):
     """Ranges agree within the effect of a fault in the authors' code: it corrects the last stamp with the delay of the
     wrong tag.
     """
-    folder = miluv(tmp_path)
+    folder, began = miluv(tmp_path), 1_706_822_508_042_560_815
     e = read_source(folder, importer="miluv").exchanges
-    published = {}
-    for path in folder.glob("*/uwb_range.csv"):
-        for row in csv.DictReader(path.read_text().splitlines()):
-            published[row["from_id"], row["to_id"], round(float(row["timestamp"]) * 1e9)] = float(row["range"])
-    began = 1_706_822_508_042_560_815
-    ends = zip(e.initiator.tolist(), e.target.tolist(), e.time_ns.tolist(), strict=True)
-    wanted = np.array([published[str(i), str(j), t - began] for i, j, t in ends])
+    rows = [row for path in folder.glob("*/uwb_range.csv") for row in csv.DictReader(path.read_text().splitlines())]
+    published = {
+        (row["from_id"], row["to_id"], round(float(row["timestamp"]) * 1e9)): float(row["range"]) for row in rows
+    }
+    ends = zip(
+        e.initiator.astype(str).tolist(), e.target.astype(str).tolist(), (e.time_ns - began).tolist(), strict=True
+    )
     found = read_miluv(shared("miluv_published_calibration.json")).apply(calib.Ranges.from_exchanges(e)).corrected_m
-    assert len(wanted) == 317
-    assert np.abs(found - wanted).max() < 0.015
-    assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.006
+    off = found - [published[one] for one in ends]
+    assert len(off) == 317
+    assert np.abs(off).max() < 0.015
+    assert np.sqrt(np.mean(off**2)) < 0.006
 
 
 SPLINE = '{"knots": [0, 0, 1, 1], "coeffs": [1, 2], "degree": 1}'
@@ -193,8 +237,10 @@ def test_miluv_calibrations_with_infinite_numbers_are_refused(tmp_path, old, new
         read_miluv(tmp_path / "m.json")
 
 
-def test_formats_with_one_curve_refuse_groups():
-    grouped = calib.fit(ranges(2000), groups={"a": (1, 2), "b": (3, 7)}).calibration
+def test_formats_with_one_curve_refuse_groups(fitted):
+    groups = {"a": TagGroup((1, 2), fitted.bias_curve, fitted.sigma_curve)}
+    groups["b"] = replace(groups["a"], tags=(3, 7))
+    grouped = replace(fitted, groups=groups)
     for form in ("miluv", "ros-yaml", "c-header"):
         with pytest.raises(calib.BadInputError, match="export it as json"):
             calib.export(grouped, form)

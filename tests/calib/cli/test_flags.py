@@ -1,8 +1,10 @@
 """The command line names options instead of parameters, and derives the options of a fit from its settings."""
 
+import copy
 import json
 import operator
 from dataclasses import fields
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -40,14 +42,10 @@ def test_settings_and_keywords_make_the_same_fit():
 
 
 def test_a_fit_repeats_its_settings(tmp_path):
-    flight, made = tmp_path / "f.uwb", tmp_path / "c.json"
-    for line in (
-        ["sample", "-o", flight, "-n", 300],
-        ["fit", flight, "-o", made, "--loss", "huber", "--fix", "1=-0.3"],
-        ["apply", flight, "-c", made, "-o", tmp_path / "d.uwb"],
-    ):
-        assert "before it converged" not in processes.succeed("calib", *line).stderr
-    assert "settings: loss = huber, fixed_ns = {'1': -0.3}" in processes.run("calib", "show", made).stdout
+    fit = "fit f.uwb -o c.json --loss huber --fix 1=-0.3"
+    for line in ("sample -o f.uwb -n 300", fit, "apply f.uwb -c c.json -o d.uwb"):
+        assert "before it converged" not in run(tmp_path, f"calib {line}").stderr
+    assert "settings: loss = huber, fixed_ns = {'1': -0.3}" in run(tmp_path, "calib show c.json").stdout
 
 
 # `calib fit --truth ranges`, as entered by a user.
@@ -106,16 +104,24 @@ def test_contradicting_options_are_refused(recording, tmp_path, words, said):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
+    """ranges.uwb and part.uwb, with the first two thirds of its ranges, and one.uwb, with those of one pair."""
     place = tmp_path_factory.mktemp("ranges")
-    write(place / "ranges.csv", Plan(bias=bias_m))
-    processes.succeed("uwblink", "import", "csv", place / "ranges.csv", "-o", place / "ranges.uwb")
+    head, *rows = write(place / "ranges.csv", Plan(bias=bias_m)).read_text().splitlines()
+    pair = [row for row in rows if sorted(row.split(",")[1:3], key=int) == ["1", "11"]]
+    for name, kept in (("ranges", rows), ("part", rows[:2000]), ("one", pair)):
+        (place / f"{name}.csv").write_text("\n".join([head, *kept, ""]))
+        processes.succeed("uwblink", "import", "csv", f"{name}.csv", "-o", f"{name}.uwb", cwd=place)
     return place
 
 
 @pytest.fixture(scope="module")
 def fitted(folder):
     """Return the output of the command that writes c.json."""
-    return processes.succeed("calib", "fit", folder / "ranges.uwb", "-o", folder / "c.json")
+    return run(folder, "calib fit ranges.uwb -o c.json")
+
+
+def run(folder, line):
+    return processes.succeed(*line.split(), cwd=folder)
 
 
 @pytest.mark.slow
@@ -123,56 +129,37 @@ def test_import_curve_localization(folder, fitted):
     assert "ranges without stamps" in fitted.stderr
     written = json.loads((folder / "c.json").read_text())
     middle = sum(written["delays_ns"][str(tag)] - delay for tag, delay in DELAYS_NS.items()) / len(DELAYS_NS)
-    for tag, delay in DELAYS_NS.items():
-        # Delays are stated for a curve that is zero at -82 dBm, so all are shifted equally.
-        assert written["delays_ns"][str(tag)] - middle == pytest.approx(delay, abs=0.05)
+    # Delays are stated for a curve that is zero at -82 dBm, so all are shifted equally.
+    expected = {str(tag): pytest.approx(delay + middle, abs=0.05) for tag, delay in DELAYS_NS.items()}
+    assert written["delays_ns"] == expected
     assert any("ranges without stamps" in warning for warning in written["provenance"]["warnings"])
-    assert "ranges without stamps" in processes.succeed("calib", "show", folder / "c.json").stdout
-    (folder / "part.csv").write_text("\n".join((folder / "ranges.csv").read_text().splitlines()[:2000]) + "\n")
-    processes.succeed("uwblink", "import", "csv", folder / "part.csv", "-o", folder / "part.uwb")
-    words = ("calib", "localize", folder / "part.uwb", "-c", folder / "c.json", "--seeds", 1, "--json")
-    located = json.loads(processes.succeed(*words).stdout)
-    assert located["summary"]["rmse_m"]["calibrated"] < 0.7 * located["summary"]["rmse_m"]["raw"]
-    processes.succeed(
-        "calib", "apply", folder / "ranges.uwb", "-c", folder / "c.json", "--to", "csv", "-o", folder / "out"
-    )
+    assert "ranges without stamps" in run(folder, "calib show c.json").stdout
+    located = json.loads(run(folder, "calib localize part.uwb -c c.json --seeds 1 --json").stdout)["summary"]["rmse_m"]
+    assert located["calibrated"] < 0.7 * located["raw"]
+    run(folder, "calib apply ranges.uwb -c c.json --to csv -o out")
     corrected = np.genfromtxt(folder / "out" / "corrected.csv", delimiter=",", names=True, dtype=None, encoding=None)
     assert np.mean(corrected["sigma_m"]) == pytest.approx(0.04, rel=0.15)
-    judged = json.loads(
-        processes.succeed("calib", "evaluate", folder / "ranges.uwb", "-c", folder / "c.json", "--json").stdout
-    )
+    judged = json.loads(run(folder, "calib evaluate ranges.uwb -c c.json --json").stdout)
     # The planted noise is 4 cm.
     assert judged["overall"]["full"]["robust_std_m"] == pytest.approx(0.041, abs=0.004)
 
 
 @pytest.mark.usefixtures("fitted")
 def test_constants_of_pairs_by_commands(folder):
-    done = processes.succeed(
-        "calib", "fit", folder / "ranges.uwb", "-o", folder / "p.json", "--constants", "pair", "--delays-only"
-    )
+    done = run(folder, "calib fit ranges.uwb -o p.json --constants pair --delays-only")
     assert "pair    1-11" in done.stdout
     assert "delays only" in done.stderr
-    assert "constants of 12 pairs" in processes.succeed("calib", "show", folder / "p.json").stdout
-    assert (
-        "between pairs" in processes.succeed("calib", "evaluate", folder / "ranges.uwb", "-c", folder / "p.json").stdout
-    )
-    processes.succeed(
-        "calib", "fit", folder / "ranges.uwb", "-o", folder / "q.json", "--delays-from", folder / "c.json"
-    )
-    shown = processes.succeed("calib", "show", folder / "q.json").stdout
+    assert "constants of 12 pairs" in run(folder, "calib show p.json").stdout
+    assert "between pairs" in run(folder, "calib evaluate ranges.uwb -c p.json").stdout
+    run(folder, "calib fit ranges.uwb -o q.json --delays-from c.json")
+    shown = run(folder, "calib show q.json").stdout
     assert "fitted: curve only" in shown
     assert "warning: curve only" in shown
 
 
 def test_one_pair_is_evaluated_without_a_number_between_pairs(folder):
-    head, *rows = (folder / "ranges.csv").read_text().splitlines()
-    kept = [row for row in rows if sorted(row.split(",")[1:3], key=int) == ["1", "11"]]
-    (folder / "one.csv").write_text("\n".join([head, *kept]) + "\n")
-    processes.succeed("uwblink", "import", "csv", folder / "one.csv", "-o", folder / "one.uwb")
-    processes.succeed(
-        "calib", "fit", folder / "one.uwb", "-o", folder / "one.json", "--constants", "pair", "--delays-only"
-    )
-    told = processes.succeed("calib", "evaluate", folder / "one.uwb", "-c", folder / "one.json").stdout
+    run(folder, "calib fit one.uwb -o one.json --constants pair --delays-only")
+    told = run(folder, "calib evaluate one.uwb -c one.json").stdout
     assert "are within pairs" in told
     assert "nan" not in told
 
@@ -181,38 +168,29 @@ def test_one_pair_is_evaluated_without_a_number_between_pairs(folder):
 
 
 @pytest.fixture
-def stopped_flight(tmp_path):
-    calib.sample_flight().save(tmp_path / "flight.uwb")
-    return tmp_path / "flight.uwb"
-
-
-@pytest.fixture
-def stopped(stopped_flight, monkeypatch, tmp_path):
+def stopped(monkeypatch, tmp_path):
+    """Return the output of a command that stops before it converges and writes c.json."""
+    calib.sample_flight().save(tmp_path / "f.uwb")
     monkeypatch.setattr(optimize, "MOST_STEPS", 2)
-    return processes.run("calib", "fit", stopped_flight, "-o", tmp_path / "c.json"), tmp_path / "c.json"
+    return processes.run(*["calib", "fit", "f.uwb", "-o", "c.json"], cwd=tmp_path)
 
 
-def test_stopped_fits_are_marked_and_have_status_1(stopped, stopped_flight, tmp_path):
-    done, path = stopped
-    assert "stopped after" in done.stdout
-    assert "before it converged" in done.stderr
-    assert "NOT CONVERGED" in repr(calib.load_calibration(path))
-    as_json = processes.run("calib", "fit", stopped_flight, "-o", tmp_path / "d.json", "--json")
-    assert (done.returncode, as_json.returncode) == (1, 1)
-    for text in (path.read_text(), as_json.stdout):
+def test_stopped_fits_are_marked_and_have_status_1(stopped, tmp_path):
+    assert "stopped after" in stopped.stdout
+    assert "before it converged" in stopped.stderr
+    assert "NOT CONVERGED" in repr(calib.load_calibration(tmp_path / "c.json"))
+    as_json = processes.run(*["calib", "fit", "f.uwb", "-o", "d.json", "--json"], cwd=tmp_path)
+    assert (stopped.returncode, as_json.returncode) == (1, 1)
+    for text in ((tmp_path / "c.json").read_text(), as_json.stdout):
         assert json.loads(text)["provenance"]["converged"] is False
 
 
-def test_commands_warn_of_stopped_fits(stopped, stopped_flight, tmp_path):
-    path = stopped[1]
-    for words in (
-        ("apply", stopped_flight, "-c", path, "-o", tmp_path / "corrected.uwb"),
-        ("evaluate", stopped_flight, "-c", path),
-        ("export", path, "--to", "csv"),
-        ("compare", path, path),
-    ):
-        assert "stopped before it converged" in processes.succeed("calib", *words).stderr, words[0]
-    assert "NOT CONVERGED" in processes.succeed("calib", "show", path).stdout
+@pytest.mark.usefixtures("stopped")
+def test_commands_warn_of_stopped_fits(tmp_path):
+    lines = ("apply f.uwb -c c.json -o corrected.uwb", "evaluate f.uwb -c c.json", "export c.json --to csv")
+    for line in (*lines, "compare c.json c.json"):
+        assert "stopped before it converged" in run(tmp_path, f"calib {line}").stderr, line
+    assert "NOT CONVERGED" in run(tmp_path, "calib show c.json").stdout
 
 
 # Calibrations whose provenance is damaged: one line and status 2, or everything that does not need the entry.
@@ -242,22 +220,19 @@ def document():
     ids=str,
 )
 def test_a_damaged_entry_is_one_line_where_it_is_used(document, tmp_path, entry, value):
-    processes.succeed("calib", "sample", "-o", tmp_path / "a.uwb", "-n", "900")
-    changed = json.loads(json.dumps(document))
-    table = changed["provenance"]
-    for key in entry[:-1]:
-        table = operator.getitem(table, key)
-    table[entry[-1]] = value
+    calib.sample_flight().save(tmp_path / "a.uwb")
+    changed, (*outer, last) = copy.deepcopy(document), entry
+    reduce(operator.getitem, outer, changed["provenance"])[last] = value
     (tmp_path / "c.json").write_text(json.dumps(changed))
-    page = tmp_path / "r.html"
-    judged = processes.run("calib", "evaluate", tmp_path / "a.uwb", "-c", tmp_path / "c.json", "--report", page)
-    shown = processes.run("calib", "show", tmp_path / "c.json")
+    judged, shown = (
+        processes.run("calib", *words.split(), cwd=tmp_path)
+        for words in ("evaluate a.uwb -c c.json --report r.html", "show c.json")
+    )
     for done in (judged, shown):
         assert "Traceback" not in done.stderr
         assert done.returncode in (0, 2)
-        if done.returncode:
-            assert "its provenance is not as uwbcal writes it" in " ".join(done.stderr.split())
-    assert page.exists() == (judged.returncode == 0)
+        assert not done.returncode or "its provenance is not as uwbcal writes it" in " ".join(done.stderr.split())
+    assert (tmp_path / "r.html").exists() == (judged.returncode == 0)
 
 
 def test_calibrations_of_version_0_2_are_read_by_the_old_names_of_keys(document):

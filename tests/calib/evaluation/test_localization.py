@@ -1,6 +1,5 @@
 """The EKF: consistent on clean ranges, more accurate with a calibration, and able to recover."""
 
-import tomllib
 from dataclasses import replace
 from itertools import product
 
@@ -17,9 +16,9 @@ from calib.evaluation.localization import (
     write_tum,
 )
 from calib.evaluation.tracking import Settings, problems
-from calib.online import RangeErrors, Reflections, gated_update, mixture_update
+from calib.online import RangeErrors, Reflections, mixture_update
 from calib.report.figures import rmse_bars
-from tests.calib.synthetic import calibration, constant_curve
+from tests.calib.synthetic import calibration, constant_curve, track_errors
 from tests.shared_data import ROOT
 from uwblink.pages.figures import style
 from uwbsim import load, simulate
@@ -28,11 +27,8 @@ SCENARIOS = ROOT / "scenarios" / "icra2023"
 
 
 @pytest.fixture(scope="module")
-def flights(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("flights")
-    for name in ("train", "test1"):
-        simulate(load(SCENARIOS / f"{name}.toml")).save(folder / f"{name}.uwb")
-    return {name: load_flight(folder / f"{name}.uwb") for name in ("train", "test1")}
+def flights():
+    return {name: load_flight(simulate(load(SCENARIOS / f"{name}.toml"))) for name in ("train", "test1")}
 
 
 @pytest.fixture(scope="module")
@@ -64,10 +60,9 @@ def clean(flight: Flight, sigma_m=0.08) -> tuple[Flight, Calibration]:
 def test_the_filter_is_consistent_on_clean_ranges(flights):
     # Without a gate, which rejects the largest hundredth of NIS.
     found = summarize(localize(*clean(flights["test1"]), Settings(gate=1e9, seeds=1)))
-    assert found.nis_bounds[0] < found.nis < found.nis_bounds[1]
-    assert found.nees_bounds[0] < found.nees < found.nees_bounds[1]
-    assert found.nis_bounds[1] - found.nis_bounds[0] < 0.05
-    assert found.nees_bounds[1] - found.nees_bounds[0] < 1.5
+    for mean, (low, high), width in ((found.nis, found.nis_bounds, 0.05), (found.nees, found.nees_bounds, 1.5)):
+        assert low < mean < high
+        assert high - low < width
     # Single values: 95 % are within their own bounds, up to the effect of correlation.
     assert found.nis_inside == pytest.approx(0.95, abs=0.01)
     assert found.nees_inside == pytest.approx(0.95, abs=0.03)
@@ -75,12 +70,11 @@ def test_the_filter_is_consistent_on_clean_ranges(flights):
 
 def test_a_body_that_ranges_only_where_its_place_is_unknown_is_left_out(short):
     flight, known = clean(beginning(short, 2))
-    bodies = sorted({tag.body for tag in flight.tags})
-    last = short.ranges.time_ns.max()
+    first, *others = sorted({tag.body for tag in flight.tags})
     # The poses of one body are later than all ranges.
-    time = np.where(flight.poses.body == bodies[0], flight.poses.time_ns + last, flight.poses.time_ns)
+    time = flight.poses.time_ns + short.ranges.time_ns.max() * (flight.poses.body == first)
     poses = replace(flight.poses, time_ns=time)[np.argsort(time, kind="stable")]
-    assert {one.body for one in localize(replace(flight, poses=poses), known, Settings(seeds=1))} == set(bodies[1:])
+    assert {one.body for one in localize(replace(flight, poses=poses), known, Settings(seeds=1))} == set(others)
 
 
 @pytest.mark.slow
@@ -95,7 +89,7 @@ def test_localization_without_data_is_refused(short):
     flight, known = clean(beginning(short, 1))
     with pytest.raises(UnanswerableError, match="ifo001"):
         summarize(localize(flight, known, Settings(gate=1e-12, seeds=1)))
-    still = replace(flight, poses=replace(flight.poses, position_m=flight.poses.position_m * 0))
+    still = replace(flight, poses=replace(flight.poses, position_m=0 * flight.poses.position_m))
     with pytest.raises(UnanswerableError, match="memory"):
         localize(still, known)
 
@@ -127,9 +121,8 @@ def test_fixed_variances_are_those_of_the_training_flight(flights, fitted):
     found = fixed_std(exact, Settings(seeds=1), flight)
     assert found.std_m["calibrated"] in (0.07, 0.1, 0.14)
     assert "tuned on" in found.source
-    known = fixed_std(fitted, Settings())
-    errors = flights["train"].ranges.raw_m - flights["train"].ranges.truth_m
-    assert known.std_m["raw"] == pytest.approx(np.std(errors))
+    known, train = fixed_std(fitted, Settings()), flights["train"].ranges
+    assert known.std_m["raw"] == pytest.approx(np.std(train.raw_m - train.truth_m))
     assert known.std_m["calibrated"] < known.std_m["raw"]
     assert fixed_std(fitted, Settings(fixed_std_m=0.3)).std_m == {"raw": 0.3, "calibrated": 0.3}
     # Ranges without true distances give the same: the flight itself has no effect.
@@ -139,14 +132,11 @@ def test_fixed_variances_are_those_of_the_training_flight(flights, fitted):
 def test_each_body_and_flight_has_noise_of_its_own(short):
     flight, known = clean(short)
     one = localize(flight, known, Settings(seeds=2, gate=1e9))[0]
-    first = [
-        np.diff((one.tracks[name].estimate_m - one.tracks[name].truth_m)[:200], axis=0) for name in ("raw", "variance")
-    ]
-    assert np.corrcoef(first[0].ravel(), first[1].ravel())[0, 1] > 0.8, "filters of a body see the same noise"
+    tracks = (one.tracks[name] for name in ("raw", "variance"))
+    steps = [np.diff((track.estimate_m - track.truth_m)[:200], axis=0).ravel() for track in tracks]
+    assert np.corrcoef(steps)[0, 1] > 0.8, "filters of a body see the same noise"
     drawn = [p.noisy(Settings(), 0)[1] - np.diff(p.place, axis=0, prepend=p.place[:1]) for p in problems(flight)]
-    assert abs(np.corrcoef(drawn[0][:200].ravel(), drawn[1][:200].ravel())[0, 1]) < 0.2, (
-        "600 values of other noise: 0.04"
-    )
+    assert abs(np.corrcoef([noise[:200].ravel() for noise in drawn[:2]])[0, 1]) < 0.2, "600 values of other noise: 0.04"
     assert one.rmse_m["raw"][0] != one.rmse_m["raw"][1]
     again = localize(flight, known, Settings(seeds=1, seed=1, gate=1e9))[0]
     assert again.rmse_m["raw"][0] == one.rmse_m["raw"][1]
@@ -157,9 +147,8 @@ def test_each_body_and_flight_has_noise_of_its_own(short):
 def test_a_wrong_start_is_left_within_two_seconds(flights, fitted, offset):
     for one in localize(beginning(flights["test1"], 4), fitted, Settings(seeds=1, initial_offset_m=offset)):
         for track in one.tracks.values():
-            wrong = np.linalg.norm(track.estimate_m - track.truth_m, axis=1)
-            assert wrong[0] > 2
-            assert wrong[track.time_ns > track.time_ns[0] + 2_000_000_000].max() < 0.8
+            assert track_errors(track)[0] > 2
+            assert track_errors(track, 2.0).max() < 0.8
 
 
 @pytest.mark.slow
@@ -171,40 +160,35 @@ def test_the_filter_recovers_after_wrong_ranges(flights, far_m, offset):
     early = flight.ranges.time_ns < flight.ranges.time_ns.min() + 2_000_000_000
     flight.ranges.raw_m[early] += far_m
     for one in localize(flight, known, Settings(seed=3, seeds=1, initial_offset_m=offset)):
-        track = one.tracks["variance"]
-        wrong = np.linalg.norm(track.estimate_m - track.truth_m, axis=1)
-        wrong = wrong[track.time_ns > track.time_ns.min() + 4_000_000_000]
         # Two seconds after the last wrong range it has recovered, and converges.
+        wrong = track_errors(one.tracks["variance"], 4.0)
         assert wrong.max() < 1.0
         assert np.median(wrong) < 0.15
 
 
 @pytest.mark.parametrize(("name", "value"), [("velocity_std_mps", 0.0), ("gate", float("nan")), ("seeds", 0)])
 def test_wrong_settings_of_filters_are_refused(name, value):
-    with pytest.raises(BadInputError) as caught:
+    with pytest.raises(BadInputError, match=f"^`{name}`"):
         Settings(**{name: value})
-    assert caught.value.parameter == name
 
 
 def test_trajectories_are_written_in_tum_form_with_their_attitudes(short, tmp_path):
     flight, known = clean(beginning(short, 2))
     found = localize(flight, known, Settings(seeds=1))
-    track = found[0].tracks["raw"]
+    track, poses = found[0].tracks["raw"], flight.poses[flight.poses.body == found[0].body]
     write_tum(found, tmp_path)
     rows = np.loadtxt(tmp_path / f"memory-{found[0].body}-raw.tum")
     np.testing.assert_allclose(rows[:, 1:4], track.estimate_m, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1, atol=1e-5)
-    mine, k = flight.poses.body == found[0].body, len(rows) // 2
-    near = np.argmin(np.abs(flight.poses.time_ns[mine] - track.time_ns[k]))
-    np.testing.assert_allclose(rows[k, 4:], flight.poses.quaternion[mine][near], atol=1e-6)
+    nearest = np.argmin(np.abs(poses.time_ns - track.time_ns[:, None]), axis=1)
+    np.testing.assert_allclose(rows[:, 4:], poses.quaternion[nearest], atol=1e-6)
     assert len(list(tmp_path.glob("*.tum"))) == 3 * 4
     assert next(tmp_path.glob("*truth.tum")).read_text().startswith("# time")
 
 
 def test_recordings_of_one_name_keep_their_own_trajectories(tmp_path):
-    samples = [sample_flight(60, seed=seed) for seed in (1, 2)]
     known = fit(sample_flight()).calibration
-    write_tum([one for flight in samples for one in localize(flight, known)], tmp_path)
+    write_tum([one for seed in (1, 2) for one in localize(sample_flight(60, seed=seed), known)], tmp_path)
     raw = sorted(path.name for path in tmp_path.glob("*-raw.tum"))
     assert raw == sorted(f"memory-robot{k}{end}-raw.tum" for k in (1, 2, 3) for end in ("", "_2"))
     assert (tmp_path / raw[0]).read_text() != (tmp_path / raw[1]).read_text()
@@ -266,15 +250,8 @@ def test_mean_and_variance_of_the_noise_are_those_of_draws(draws, value):
 def test_extreme_innovations_are_finite_and_rejected():
     update = mixture_update(np.array([-50.0, 1e3, 1e5]), np.full(3, STD**2), ERRORS)
     assert not update.accepted.any()
-    assert np.isfinite(update.noise_m).all()
     np.testing.assert_allclose(update.noise_m, 0, atol=1e-6)
     np.testing.assert_allclose(update.variance_m2, STD**2, rtol=1e-6)
-
-
-def test_a_gate_accepts_or_rejects():
-    update = gated_update(np.array([0.2, 0.4]), np.full(2, 0.01), 9.0)
-    assert (update.accepted.tolist(), update.noise_m.tolist()) == ([True, False], [0.2, 0.0])
-    assert update.variance_m2.tolist() == [0.0, 0.01]
 
 
 def test_probabilities_of_reflections_agree_with_all_histories():
@@ -305,10 +282,9 @@ def test_lasting_reflections_do_not_mislead_the_filter():
 
     A filter that assumes independent ranges of a pair has a NEES of 24 here, and an error of 20 cm.
     """
-    table = tomllib.loads((ROOT / "scenarios/hall_with_metal/hall.toml").read_text())
     first, second = (
-        simulate(table | {"run": table["run"] | {"seed": seed, "duration_s": 40.0}}) for seed in (592, 692)
+        simulate(load("hall_with_metal/hall", {"run.seed": seed, "run.duration_s": 40.0})) for seed in (592, 692)
     )
-    found = localize(load_flight(second), fit(first).calibration, Settings(seeds=1))
+    found = localize(second, fit(first), Settings(seeds=1))
     assert np.mean(np.concatenate([one.tracks["robust"].nees for one in found])) < 10
     assert summarize(found).rmse_m["robust"] < 0.16

@@ -57,22 +57,26 @@ def wrong_m(delays_ns, drift_m):
 @pytest.mark.slow
 def test_the_command_compares_states_with_fixed_delays_and_prints_their_end(known, tmp_path):
     known.save(tmp_path / "known.json")
-    drift_m = {1: 0.06, 2: 0.06}
+    drift_m, line = {1: 0.06, 2: 0.06}, "calib localize test.uwb -c known.json --online"
+
+    def run(more):
+        return succeed(*line.split(), *more.split(), cwd=tmp_path).stdout
+
+    def wrong(table):
+        return np.abs(wrong_m({int(tag): one["delay_ns"] for tag, one in table["delays"].items()}, drift_m))
+
     flight(7, 24.0, rate_hz=50, drift_m=drift_m)[0].save(tmp_path / "test.uwb")
-    words = ("calib", "localize", tmp_path / "test.uwb", "-c", tmp_path / "known.json", "--online")
-    table = json.loads(succeed(*words, "--seeds", 1, "--json").stdout)
+    table = json.loads(run("--seeds 1 --json"))
     rmse, (row,) = table["summary"]["rmse_m"], table["scenarios"]
     assert rmse["online"] < 0.8 * rmse["robust"]
-    delays = {int(tag): one["delay_ns"] for tag, one in row["delays"].items()}
-    assert np.abs(wrong_m(delays, drift_m)).max() < 0.03 < np.abs(wrong_m(known.delays_ns, drift_m)).min() - 0.02
+    assert wrong(row).max() < 0.03 < np.abs(wrong_m(known.delays_ns, drift_m)).min() - 0.02
     # Without motion capture: a track of each kind.
-    fixed, online = json.loads(succeed(*words, "--model", "constant-velocity", "--json").stdout)
+    fixed, online = json.loads(run("--model constant-velocity --json"))
     assert (fixed.keys() ^ online.keys(), online["rmse_m"] < fixed["rmse_m"]) == ({"delays", "drifting"}, True)
     assert min(row["drifting"], online["drifting"]) > 0.5
-    delays = {int(tag): one["delay_ns"] for tag, one in online["delays"].items()}
-    assert np.abs(wrong_m(delays, drift_m)).max() < 0.05
+    assert wrong(online).max() < 0.05
     flight(7, 2.0)[0].save(tmp_path / "test.uwb", force=True)
-    text = succeed(*words, "--seeds", 1).stdout
+    text = run("--seeds 1")
     assert re.search(r"raw +calibrated +variance +robust +online", text)
     assert re.search(r"delays at the end of test.uwb robot \(ns\): 1: [+-]0\.\d+ ± 0\.\d+ \(95 %\), 2: ", text)
     assert re.search(r"they drift with a probability of \d+ % at the end, \d+ % on average", text)
@@ -88,16 +92,19 @@ def test_residuals_are_those_of_the_likelihood(known):
     one = RangeUpdate.of(known, Ranges.from_arrays(3.0, initiator=1, target=12, fpp1_dbm=-85.0))
     many, around = one.at(np.zeros(400, dtype=int)), np.linspace(-0.4, 2.0, 400)
     residual, slope = many.whiten(around)
+    likely = many.weigh(around)
     best = one.weigh(np.linspace(-0.05, 0.05, 2001)).log_density.max()
-    np.testing.assert_allclose(residual**2 / 2, best - many.weigh(around).log_density, atol=1e-6)
+    np.testing.assert_allclose(residual**2 / 2, best - likely.log_density, atol=1e-6)
     assert np.all(np.diff(residual) > 0)
     # Outliers have no information: their slope is not compared where they are likely.
-    inside = many.weigh(around).accepted
     further = (many.whiten(around + 1e-6)[0] - many.whiten(around - 1e-6)[0]) / 2e-6
-    np.testing.assert_allclose(slope[inside], further[inside], rtol=0.02, atol=1e-3)
+    np.testing.assert_allclose(slope[likely.accepted], further[likely.accepted], rtol=0.02, atol=1e-3)
+
+
+def test_ranges_without_power_cannot_update():
+    ranges = Ranges.from_arrays(3.0, initiator=1, target=2, fpp1_dbm=[-85.0, np.nan])
     with pytest.raises(BadInputError, match="range 1 has no power"):
-        dbm = [-85.0, np.nan]
-        RangeUpdate.of(fit(sample_flight()).calibration, Ranges.from_arrays(3.0, initiator=1, target=2, fpp1_dbm=dbm))
+        RangeUpdate.of(fit(sample_flight()).calibration, ranges)
 
 
 @pytest.mark.slow
@@ -139,14 +146,13 @@ def test_late_drifts_are_followed(known):
 
 
 @pytest.mark.slow
-def test_without_motion_capture_drifting_delays_cost_nothing_and_are_followed(known):
-    for drift_m, least, most in (({}, 0.9, 1.02), (DRIFT_M, 0.4, 0.95)):
-        tracks = localize_onboard(
-            flight(31, 40.0, drift_m=drift_m)[0], known, OnboardSettings(model="constant-velocity", online=True)
-        )
-        assert least < tracks[1].rmse_m / tracks[0].rmse_m < most
-        delays = {tag: delay for tag, (delay, _) in tracks[1].delays.items()}
-        assert np.abs(wrong_m(delays, drift_m)).max() < max(0.06, 0.6 * np.abs(wrong_m(known.delays_ns, drift_m)).max())
+@pytest.mark.parametrize(("drift_m", "least", "most"), [({}, 0.9, 1.02), (DRIFT_M, 0.4, 0.95)])
+def test_without_motion_capture_drifting_delays_cost_nothing_and_are_followed(known, drift_m, least, most):
+    settings = OnboardSettings(model="constant-velocity", online=True)
+    fixed, online = localize_onboard(flight(31, 40.0, drift_m=drift_m)[0], known, settings)
+    assert least < online.rmse_m / fixed.rmse_m < most
+    delays = {tag: delay for tag, (delay, _) in online.delays.items()}
+    assert np.abs(wrong_m(delays, drift_m)).max() < max(0.06, 0.6 * np.abs(wrong_m(known.delays_ns, drift_m)).max())
 
 
 def smoothed(ranges, known, anchors_m, moves_m, std_m):
@@ -243,14 +249,15 @@ def without(known):
     return replace(known, errors=replace(errors, noise_m=tuple(errors.within_m(np.array(errors.noise_m))), between_m=0))
 
 
-def robust(contents, known) -> Track:
-    return localize(contents, known, Settings(seeds=1))[0].tracks["robust"]
+def robust(seeds, known, offset_m=0.0) -> list[Track]:
+    """Return a track of the robust filter for each flight."""
+    flights = (flight(seed, 40.0, offset_m=offset_m)[0] for seed in seeds)
+    return [localize(one, known, Settings(seeds=1))[0].tracks["robust"] for one in flights]
 
 
 @pytest.mark.slow
 def test_constants_of_pairs_are_followed(differing):
-    flights = [flight(seed, 40.0, offset_m=OFFSET_M)[0] for seed in (21, 22, 23, 24)]
-    own, fixed = ([robust(one, by) for one in flights] for by in (differing, without(differing)))
+    own, fixed = (robust((21, 22, 23, 24), by, OFFSET_M) for by in (differing, without(differing)))
     # One prior for both: 14 constants are determined from 40 s of ranges to about 2 cm.
     assert np.mean([one.rmse_m for one in own]) < 0.75 * np.mean([one.rmse_m for one in fixed])
     assert min(one.offsets[-1] for one in own) > 0.99
@@ -262,8 +269,7 @@ def test_constants_of_pairs_are_followed(differing):
 
 @pytest.mark.slow
 def test_without_constants_of_pairs_the_filter_is_as_accurate(differing):
-    flights = [flight(seed, 40.0)[0] for seed in (31, 32, 33, 34)]
-    own, fixed = ([robust(one, by) for one in flights] for by in (differing, without(differing)))
+    own, fixed = (robust((31, 32, 33, 34), by) for by in (differing, without(differing)))
     assert np.mean([one.rmse_m for one in own]) < 1.005 * np.mean([one.rmse_m for one in fixed])
     assert np.mean([one.offsets.mean() for one in own]) < 0.2
 
@@ -273,9 +279,9 @@ def test_the_command_reports_that_pairs_differ(differing, tmp_path):
     differing.save(tmp_path / "known.json")
     for name, offset_m in (("same", 0.0), ("differs", OFFSET_M)):
         flight(41, 4.0, offset_m=offset_m)[0].save(tmp_path / f"{name}.uwb")
-    words = ("calib", "localize", tmp_path / "same.uwb", tmp_path / "differs.uwb", "-c", tmp_path / "known.json")
-    text = succeed(*words, "--seeds", 1).stdout
-    same, differs = json.loads(succeed(*words, "--seeds", 1, "--json").stdout)["scenarios"]
+    words = ["calib", "localize", "same.uwb", "differs.uwb", "-c", "known.json", "--seeds", "1"]
+    text = succeed(*words, cwd=tmp_path).stdout
+    same, differs = json.loads(succeed(*words, "--json", cwd=tmp_path).stdout)["scenarios"]
     line = r"pairs of differs.uwb robot have constant differences from the calibration .* of (9\d|100) % at the"
     assert re.search(line, text)
     assert "pairs of same.uwb" not in text
@@ -305,17 +311,16 @@ def test_the_average_over_models_has_the_moments_of_their_mixture():
 
 @pytest.mark.slow
 def test_a_team_follows_constants_of_pairs():
-    noise_m = float(np.hypot(test_team.NOISE_M, OFFSET_M))
+    noise_m, made = float(np.hypot(test_team.NOISE_M, OFFSET_M)), test_team.flight(10.0)
     errors = ErrorModel(lifted=(0.0,), noise_m=(noise_m,), tail_share=(1e-3,), least_m=0.0, detour_m=0.3,
                         outlier_share=0.0, outlier_m=0.0, between_m=OFFSET_M)  # fmt: skip
     known, (_, ends, measured_m) = replace(test_team.PLANTED, errors=errors), test_team.ranging(10.0, 1)
-    made = test_team.flight(10.0)
     offsets_m = np.triu(np.random.default_rng(5).normal(0, OFFSET_M, (7, 7)))
-    measured_m = measured_m + (offsets_m + offsets_m.T)[ends[:, 0], ends[:, 1]]
+    measured_m = measured_m + (offsets_m + offsets_m.T)[*ends.T]
     exchanges = stamped(made.exchanges.time_ns, ends, measured_m, np.full((2, len(ends)), -85.0))
-    made = replace(made, exchanges=exchanges)
     own, fixed = (
-        [one.tracks["robust"] for one in localize_team(made, by, test_team.CLOSE)] for by in (known, without(known))
+        [one.tracks["robust"] for one in localize_team(replace(made, exchanges=exchanges), by, test_team.CLOSE)]
+        for by in (known, without(known))
     )
     assert np.mean([one.rmse_m for one in own]) < 0.75 * np.mean([one.rmse_m for one in fixed])
     assert min(one.offsets[-1] for one in own) > 0.99

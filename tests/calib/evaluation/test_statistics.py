@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import make_interp_spline
 from scipy.stats import norm
 
 import calib
@@ -17,24 +18,16 @@ from uwblink import SPEED_OF_LIGHT
 
 @pytest.mark.parametrize(("pairs_m", "sessions_m"), [(0.0, 0.0), (0.05, 0.0), (0.05, 0.04)])
 def test_errors_are_split_into_within_and_between_pairs_and_sessions(pairs_m, sessions_m):
-    rng = np.random.default_rng(7)
-    parts = []
-    by_pair = pairs_m * norm.ppf((np.arange(28) + 0.5) / 28)
-    for session in range(4):
-        first, second = np.triu_indices(8, 1)
-        pair = rng.integers(0, 28, 4000)
-        error = (
-            by_pair[pair] + sessions_m * rng.permutation(by_pair / max(pairs_m, 1e-9))[pair] + rng.normal(0, 0.04, 4000)
-        )
-        error[:200] += 2.0  # reflections
-        parts.append(
-            Ranges.from_arrays(
-                3.0 + error, initiator=first[pair], target=second[pair], fpp1_dbm=-85.0, truth_m=3.0,
-                time_ns=np.arange(4000) * 10_000_000 + session * 10**15, source=f"{session}",
-            )
-        )  # fmt: skip
-    joined = concatenate(parts)
-    found = statistics.split_error(joined, joined.raw_m - joined.truth_m)
+    rng, (first, second) = np.random.default_rng(7), np.triu_indices(8, 1)
+    spread, session = norm.ppf((np.arange(28) + 0.5) / 28), np.arange(16_000) // 4000
+    own_m = pairs_m * spread + sessions_m * np.array([rng.permutation(spread) for _ in range(4)])
+    pair = rng.integers(0, 28, 16_000)
+    error = own_m[session, pair] + rng.normal(0, 0.04, 16_000) + 2.0 * (np.arange(16_000) % 4000 < 200)  # reflections
+    some = Ranges.from_arrays(
+        3.0 + error, initiator=first[pair], target=second[pair], fpp1_dbm=-85.0, truth_m=3.0,
+        time_ns=np.arange(16_000) % 4000 * 10_000_000 + session * 10**15,
+    )  # fmt: skip
+    found = statistics.split_error(concatenate([some[session == k] for k in range(4)]), error)
     assert found.sessions == 4
     assert found.within_m == pytest.approx(0.04, rel=0.15)
     assert found.between_pairs_m == pytest.approx(pairs_m, abs=0.015)
@@ -42,36 +35,25 @@ def test_errors_are_split_into_within_and_between_pairs_and_sessions(pairs_m, se
 
 
 def test_evaluations_compare_with_planted_values():
-    from scipy.interpolate import make_interp_spline
-
-    grid = np.linspace(-0.5, 2.5, 60)
-    curve = make_interp_spline(grid, bias_m(grid))
+    curve = make_interp_spline(np.linspace(-0.5, 2.5, 60), bias_m(np.linspace(-0.5, 2.5, 60)))
     planted: dict[str, object] = {"delays_ns": {str(t): d for t, d in DELAYS_NS.items()}}
     planted["bias_curve"] = {"knots": curve.t.tolist(), "coefficients": curve.c.tolist(), "degree": 3}
     r = replace(ranges(), planted=planted)
-    calibration = calib.fit(r).calibration
-    found = statistics.evaluate(r, calibration).planted
+    known = calib.fit(r).calibration
+    found = statistics.evaluate(r, known).planted
     assert sum(found.delay_error_ns.values()) == pytest.approx(0, abs=1e-12)
     # A shift of the delays and a constant of the curve cancel here.
-    moved = replace(
-        calibration,
-        delays_ns={t: d + 0.2 for t, d in calibration.delays_ns.items()},
-        bias_curve=replace(
-            calibration.bias_curve,
-            coefficients=tuple(c + 0.2e-9 * SPEED_OF_LIGHT for c in calibration.bias_curve.coefficients),
-        ),
-    )
+    shifted = tuple(c + 0.2e-9 * SPEED_OF_LIGHT for c in known.bias_curve.coefficients)
+    delays_ns = {tag: delay + 0.2 for tag, delay in known.delays_ns.items()}
+    moved = replace(known, delays_ns=delays_ns, bias_curve=replace(known.bias_curve, coefficients=shifted))
     again = statistics.evaluate(r, moved).planted
     assert again.curve_rms_m == pytest.approx(found.curve_rms_m, abs=1e-9)
     assert again.correction_rms_m == pytest.approx(found.correction_rms_m, abs=1e-6)
     # The whole correction, by hand: raw minus truth without noise and tail.
-    applied = calibration.apply(r)
-    clean = r.truth_m + bias_m(applied.lifted)
-    for tag, delay in DELAYS_NS.items():
-        clean = clean - SPEED_OF_LIGHT * 1e-9 * delay * (
-            r.weight_initiator * (r.initiator == tag) + r.weight_target * (r.target == tag)
-        )
-    wrong = (applied.corrected_m - r.raw_m + clean - r.truth_m)[~applied.clamped]
+    applied = known.apply(r)
+    delays_m = 1e-9 * SPEED_OF_LIGHT * np.array([DELAYS_NS.get(tag, 0.0) for tag in range(8)])
+    clean = bias_m(applied.lifted) - r.weight_initiator * delays_m[r.initiator] - r.weight_target * delays_m[r.target]
+    wrong = (applied.corrected_m - r.raw_m + clean)[~applied.clamped]
     assert found.correction_rms_m == pytest.approx(np.sqrt(np.mean(wrong**2)), rel=0.02)
     assert found.correction_rms_m < 0.005
 
@@ -152,15 +134,13 @@ def test_wrong_settings_of_held_out_ranges_are_refused(changes, error):
 @pytest.mark.slow
 def test_recordings_are_identified_by_content(tmp_path):
     train, test = calib.sample_flight(), calib.sample_flight(seed=2)
-    for folder, flight in (("a", train), ("b", test), ("c", train)):
-        (tmp_path / folder).mkdir()
-        flight.save(tmp_path / folder / "flight.uwb")
-    found = calib.fit(tmp_path / "a" / "flight.uwb")
-    assert calib.evaluate(tmp_path / "c" / "flight.uwb", found.calibration).seen == ("flight.uwb",)
-    assert calib.evaluate(tmp_path / "b" / "flight.uwb", found.calibration).seen == ()
-    assert calib.evaluate([train, test], found.calibration).seen == ("memory",)
-
+    a, b, c = (tmp_path / folder / "flight.uwb" for folder in "abc")
+    for path, flight in ((a, train), (b, test), (c, train)):
+        path.parent.mkdir()
+        flight.save(path)
+    found = calib.fit(a)
+    assert [calib.evaluate(data, found).seen for data in (c, b, [train, test])] == [("flight.uwb",), (), ("memory",)]
     found.save(tmp_path / "c.json")
-    for folder, warned in (("c", "warning: the calibration was fitted to flight.uwb: "), ("b", "")):
-        done = processes.run("calib", "evaluate", tmp_path / folder / "flight.uwb", "-c", tmp_path / "c.json")
+    for path, warned in ((c, "warning: the calibration was fitted to flight.uwb: "), (b, "")):
+        done = processes.run("calib", "evaluate", path, "-c", tmp_path / "c.json")
         assert (done.returncode, done.stderr[: len(warned) or None]) == (0, warned)

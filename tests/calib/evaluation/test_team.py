@@ -4,6 +4,7 @@ simulated flights with seeds that were chosen before.
 
 import json
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from calib.data.samples import stamped
 from calib.evaluation.filters import IMUS, ProcessNoise
 from calib.evaluation.team import team_json, team_text
 from tests import processes
+from tests.calib.evaluation.inertial import readings, table
 from tests.calib.synthetic import calibration
 from uwblink import Contents, Poses, Tag
 
@@ -37,13 +39,6 @@ def place(robot, t):
 def attitude(robot, t):
     turn = [0.5 * t * (-1) ** robot + robot, 0.12 * np.sin(1.1 * t + robot), 0.1 * np.cos(0.8 * t - robot)]
     return Rotation.from_euler("ZYX", np.stack(turn, axis=-1))
-
-
-def readings(robot, t):
-    """Return angular velocity and specific force in the frame of the robot, by differences of attitudes and places."""
-    turning = (attitude(robot, t - 5e-6).inv() * attitude(robot, t + 5e-6)).as_rotvec() / 1e-5
-    bend = (place(robot, t + 1e-3) - 2 * place(robot, t) + place(robot, t - 1e-3)) / 1e-6
-    return np.hstack([turning, attitude(robot, t).inv().apply(bend + np.array([0.0, 0.0, 9.81]))])
 
 
 def antenna(tag, t):
@@ -70,28 +65,24 @@ def ranging(seconds, seed, rate=60.0):
     return t, ends, np.array(exact) + NOISE_M * rng.normal(size=len(t))
 
 
-def flight(seconds=4.0, seed=1, bias=1.0, **changes):
+def flight(seconds=4.0, seed=1, bias=1.0):
     """Return a recording of three robots without anchors, whose IMUs have constant biases and no noise."""
     t, ends, measured = ranging(seconds, seed)
-    ti = np.arange(-0.05, seconds + 0.3, 1 / RATE_HZ)
-    rows = [readings(robot, ti) + biases(seed, bias)[robot] for robot in range(3)]
-    columns = dict(zip(("wx", "wy", "wz", "ax", "ay", "az"), np.vstack(rows).T, strict=True))
-    tp = np.arange(-0.1, seconds + 0.4, 0.002)
-    time_ns = np.tile(np.rint(tp * 1e9).astype(np.int64) + NS, 3)
+    ti, tp = np.arange(-0.05, seconds + 0.3, 1 / RATE_HZ), np.arange(-0.1, seconds + 0.4, 0.002)
+    ways = [(partial(place, robot), partial(attitude, robot)) for robot in range(3)]
+    rows = [readings(*way, ti) + off for way, off in zip(ways, biases(seed, bias), strict=True)]
     poses = Poses(
-        time_ns,
+        np.tile(np.rint(tp * 1e9).astype(np.int64) + NS, 3),
         np.repeat(ROBOTS, len(tp)),
-        np.vstack([place(robot, tp) for robot in range(3)]),
-        np.vstack([attitude(robot, tp).as_quat() for robot in range(3)]),
+        np.vstack([at(tp) for at, _ in ways]),
+        np.vstack([turned(tp).as_quat() for _, turned in ways]),
     )
-    made = Contents(
+    return Contents(
         exchanges=stamped((t * 1e9).astype(np.int64) + NS, ends, measured, np.full((2, len(t)), -85.0)),
         tags=[Tag(tag, ROBOTS[(tag - 1) // 2], arm) for tag, arm in ARMS.items()],
         poses=poses,
-        imu={"time_ns": np.tile(np.rint(ti * 1e9).astype(np.int64) + NS, 3), "body": np.repeat(ROBOTS, len(ti))}
-        | columns,
+        imu=table(np.rint(ti * 1e9).astype(np.int64) + NS, ROBOTS, np.vstack(rows)),
     )
-    return replace(made, **changes)
 
 
 PLANTED = calibration(dict.fromkeys(ARMS, 0.0), NOISE_M)
@@ -249,46 +240,37 @@ def test_poses_after_the_start_are_only_for_evaluation(known):
     off = np.array([5.0, -3.0, 1.0]) * (whole.poses.body == "robot2")[:, None] * (whole.poses.time_ns > 3e8)[:, None]
     elsewhere = replace(whole, poses=replace(whole.poses, position_m=whole.poses.position_m + off))
     first = replace(whole, poses=whole.poses[np.flatnonzero(whole.poses.time_ns < 3e8)])
-    found = [calib.localize_team(one, known, LISTEN) for one in (whole, elsewhere, first)]
-    for body in range(2):
-        tracks = [one[body].tracks["robust"] for one in found]
-        np.testing.assert_array_equal(tracks[0].estimate_m, tracks[2].estimate_m)
-        np.testing.assert_array_equal(tracks[0].estimate_m, tracks[1].estimate_m)
-        np.testing.assert_array_equal(tracks[0].attitude, tracks[2].attitude)
-        assert len(tracks[0].nis) == len(tracks[2].nis) > 400
-        assert np.isnan(tracks[2].truth_m[-1]).all()
-        assert (tracks[1].rmse_m > 1.0) == (body == 0)
-        assert np.isfinite(tracks[2].rmse_m)
+    found = (calib.localize_team(one, known, LISTEN) for one in (whole, elsewhere, first))
+    for body, bodies in enumerate(zip(*found, strict=True)):
+        seen, moved, blind = (one.tracks["robust"] for one in bodies)
+        np.testing.assert_array_equal([moved.estimate_m, blind.estimate_m], [seen.estimate_m] * 2)
+        np.testing.assert_array_equal(seen.attitude, blind.attitude)
+        assert len(seen.nis) == len(blind.nis) > 400
+        assert np.isnan(blind.truth_m[-1]).all()
+        assert (moved.rmse_m > 1.0) == (body == 0)
+        assert np.isfinite(blind.rmse_m)
 
 
 @pytest.mark.slow
 def test_patterns_are_corrected_by_the_estimated_poses():
     """The antennas of all robots add 20 cm to the front: exact ranges are exact after the correction."""
-    t, ends, measured = ranging(4.0, 2)
-    longer = np.zeros(len(t))
-    for k, (i, j) in enumerate(ends.tolist()):
-        for near, far in ((i, j), (j, i)):
-            away = antenna(far, t[k]) - antenna(near, t[k])
-            longer[k] += 0.2 * attitude((near - 1) // 2, t[k]).inv().apply(away / np.linalg.norm(away))[0]
-    plain = flight(seed=2)
-    exchanges = stamped((t * 1e9).astype(np.int64) + NS, ends, measured + longer, np.full((2, len(t)), -85.0))
+    plain, (t, ends, measured) = flight(seed=2), ranging(4.0, 2)
+
+    def ahead(near, far, at):
+        away = antenna(far, at) - antenna(near, at)
+        return attitude((near - 1) // 2, at).inv().apply(away / np.linalg.norm(away))[0]
+
+    longer = [0.2 * (ahead(i, j, at) + ahead(j, i, at)) for (i, j), at in zip(ends.tolist(), t, strict=True)]
+    exchanges = stamped(plain.exchanges.time_ns, ends, measured + longer, np.full((2, len(t)), -85.0))
     front = (0.2 / np.sqrt(3), *[0.0] * 7)
     known = replace(PLANTED, patterns=(Pattern(tuple(ARMS), front, (0.0,) * 8, ((0.0,) * 8,) * 8, 0.2 / np.sqrt(3)),))
-    found = [
-        one.tracks["calibrated"].rmse_m
-        for data, by in ((plain, PLANTED), (replace(plain, exchanges=exchanges), known))
-        for one in calib.localize_team(data, by, CLOSE)
-    ]
-    assert max(found[2:]) < 1.3 * max(found[:2])
-    without = [
-        one.tracks["calibrated"].rmse_m
-        for one in calib.localize_team(replace(plain, exchanges=exchanges), PLANTED, CLOSE)
-    ]
-    assert max(without) > 2 * max(found[2:])
-
-
-def kept(imu, rows):
-    return {"imu": {name: column[rows(imu)] for name, column in imu.items()}}
+    turned = replace(plain, exchanges=exchanges)
+    free, corrected, wrong = (
+        max(one.tracks["calibrated"].rmse_m for one in calib.localize_team(*both, CLOSE))
+        for both in ((plain, PLANTED), (turned, known), (turned, PLANTED))
+    )
+    assert corrected < 1.3 * free
+    assert wrong > 2 * corrected
 
 
 @pytest.mark.parametrize(
@@ -301,13 +283,13 @@ def kept(imu, rows):
             r"memory: inertial readings of 0 bodies with tags \(none\)",
         ),
         (
-            lambda flown: kept(flown.imu, lambda imu: imu["body"] == "a"),
+            lambda flown: {"imu": kept(flown.imu, flown.imu["body"] == "a")},
             {},
             calib.UnanswerableError,
             r"of 1 bodies with tags \(a\), .* two or more",
         ),
         (
-            lambda flown: kept(flown.imu, lambda imu: (imu["body"] != "b") | (imu["time_ns"] < NS + 10**9)),
+            lambda flown: {"imu": kept(flown.imu, (flown.imu["body"] != "b") | (flown.imu["time_ns"] < NS + 10**9))},
             {},
             calib.UnanswerableError,
             r"inertial readings of b cover -0.1 to 1.0 s .* is at 2.0 s",
@@ -327,6 +309,10 @@ def test_missing_sensors_are_named(change, settings, error, said):
     contents = flight(2.0)
     with pytest.raises(error, match=said):
         calib.localize_team(replace(contents, **change(contents)), PLANTED, replace(CLOSE, **settings))
+
+
+def kept(imu, rows):
+    return {name: column[rows] for name, column in imu.items()}
 
 
 def test_a_body_with_one_tag_is_named():
@@ -381,9 +367,12 @@ def test_the_command_prints_writes_and_refuses(known, tmp_path):
 
 @pytest.mark.slow
 def test_delays_that_a_calibration_has_wrong_within_its_errors_are_corrected_on_the_way():
-    off = dict(zip(ARMS, [0.4, -0.3, 0.5, 0.3, -0.4, 0.3], strict=True))
-    known = replace(PLANTED, delays_ns=off, delays_std_ns=dict.fromkeys(ARMS, 0.4))
+    off = np.array([0.4, -0.3, 0.5, 0.3, -0.4, 0.3])
+    known = replace(
+        PLANTED, delays_ns=dict(zip(ARMS, off.tolist(), strict=True)), delays_std_ns=dict.fromkeys(ARMS, 0.4)
+    )
     for found in calib.localize_team(flight(6.0), known, replace(CLOSE, online=True)):
         assert found.rmse_m["online"].mean() < 0.7 * found.rmse_m["variance"].mean()
-        assert np.abs(np.array([delay / std for delay, std in found.delays.values()])).max() < 3.5
-        assert np.sum([delay**2 for delay, _ in found.delays.values()]) < 0.3 * np.sum(np.square([*off.values()]))
+        delay, std = np.array([*found.delays.values()]).T
+        assert np.abs(delay / std).max() < 3.5
+        assert np.sum(delay**2) < 0.3 * np.sum(off**2)

@@ -1,15 +1,21 @@
 """Delays and curves together: planted values, the gauge, and data that do not determine the result."""
 
+import json
 import math
+import re
 from dataclasses import replace
 from typing import Any
 
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from threadpoolctl import threadpool_limits
 
 import calib
+from calib.calibration.power_curves import basis, curvature, lifted_power
+from calib.data.ranges import without_static
+from calib.estimator import known_distances
 from calib.estimator.losses import LOSSES, register_loss
 from calib.findings import Finding
 from tests.calib.synthetic import DELAYS_NS, about_their_mean, bias_m, design, ranges
@@ -55,11 +61,16 @@ def test_a_warning_states_that_a_reference_power_has_no_effect(settings):
     assert any("reference power has no effect" in text for text in texts) == without_effect
 
 
-def test_ranges_left_out_as_static_have_no_warning():
+def test_ranges_left_out_have_a_warning_unless_they_are_static():
     some = ranges(600)
-    asked, missing = (calib.fit(replace(some, excluded={why: 400})) for why in ("static", "no power"))
-    assert not [warning for warning in asked.warnings if "left out" in warning]
-    assert [warning for warning in missing.warnings if "left out" in warning and "no power" in warning]
+    static, missing = (calib.fit(replace(some, excluded={why: 200})).warnings for why in ("static", "no power"))
+    assert not [warning for warning in static if "left out" in warning]
+    assert [warning for warning in missing if "25 % of the exchanges were left out: no power" in warning]
+
+
+def test_single_sided_ranges_without_reply_times_have_a_warning():
+    found = calib.fit(replace(ranges(3000), protocol=np.full(3000, "ss")))
+    assert [warning for warning in found.warnings if "single-sided ranges without reply times" in warning]
 
 
 @pytest.mark.parametrize(("by_m", "way"), [(0.3, "longer"), (-0.3, "shorter")])
@@ -71,19 +82,17 @@ def test_the_sign_of_a_pairs_error_is_stated(by_m, way):
     found = calib.fit(replace(some, initiator=first, target=second, raw_m=some.raw_m + off))
     (named,) = [one for one in found.findings if one.evidence.startswith("pair 2-7") and "initiates" in one.evidence]
     assert f"{way} if tag 2 initiates" in named.evidence
-    assert named.p_value is not None
-    assert 0 < named.p_value < 1e-6
+    assert 0 < (named.p_value or 0) < 1e-6
 
 
 @pytest.mark.slow
 def test_the_mixture_estimates_delays_better_than_a_loss():
-    errors: dict[str, list[float]] = {"cauchy": [], "mixture": []}
-    for seed in range(4):
-        r = ranges(6000, tail=0.3, seed=seed)
-        for loss, found in errors.items():
-            found += about_their_mean(calib.fit(r, loss=loss).calibration, DELAYS_NS)[0].tolist()
-    spread = {loss: np.std(found) for loss, found in errors.items()}
-    assert spread["mixture"] < 0.9 * spread["cauchy"]
+    worlds = [ranges(6000, tail=0.3, seed=seed) for seed in range(4)]
+    cauchy, mixture = (
+        np.std([about_their_mean(calib.fit(r, loss=loss).calibration, DELAYS_NS)[0] for r in worlds])
+        for loss in ("cauchy", "mixture")
+    )
+    assert mixture < 0.9 * cauchy
 
 
 @pytest.mark.slow
@@ -101,8 +110,7 @@ def test_a_pinned_delay_stays_and_determines_a_single_pair():
     # The curve is zero at its reference; the planted one is not, and the other delay compensates that.
     c = calib.fit(pair, fixed_ns={1: DELAYS_NS[1]}).calibration
     assert c.delays_ns[1] == DELAYS_NS[1]
-    grid = np.linspace(*c.bias_curve.range, 400)
-    both = 0.5 * (c.delays_ns[2] - DELAYS_NS[2]) * 1e-9 * SPEED_OF_LIGHT
+    grid, both = np.linspace(*c.bias_curve.range, 400), 0.5 * (c.delays_ns[2] - DELAYS_NS[2]) * 1e-9 * SPEED_OF_LIGHT
     assert np.sqrt(np.mean((c.bias_curve(grid) - both - bias_m(grid)) ** 2)) < 0.01
 
 
@@ -117,11 +125,11 @@ def test_ranges_without_any_error_have_no_delays_and_no_curve(loss):
 @pytest.mark.slow
 def test_a_fit_is_the_same_to_the_last_digit_whatever_the_number_of_threads():
     # Sums by several threads have other last digits than those by one.
-    found = []
+    found = set()
     for threads in (1, 4):
         with threadpool_limits(threads, user_api="blas"):
-            found.append(calib.fit(ranges(6000)).calibration.to_json())
-    assert found[0] == found[1]
+            found.add(calib.fit(ranges(6000)).calibration.to_json())
+    assert len(found) == 1
 
 
 def test_ranges_far_too_short_are_counted_as_outliers():
@@ -139,8 +147,7 @@ def test_a_scale_that_is_given_is_the_scale_of_the_loss():
     assert calib.fit(some, loss="cauchy", scale_ns=0.3).calibration.scale_ns == pytest.approx(0.3)
     # Far above all errors, the Cauchy loss is that of least squares.
     wide, squares = calib.fit(some, loss="cauchy", scale_ns=1000.0), calib.fit(some, loss="l2")
-    for tag in DELAYS_NS:
-        assert wide.calibration.delays_ns[tag] == pytest.approx(squares.calibration.delays_ns[tag], abs=1e-4)
+    assert wide.calibration.delays_ns == pytest.approx(squares.calibration.delays_ns, abs=1e-4)
 
 
 def test_the_band_of_the_curve_includes_the_uncertain_smoothness(monkeypatch):
@@ -180,22 +187,21 @@ def test_the_band_of_the_curve_includes_the_uncertain_smoothness(monkeypatch):
     ],
 )
 def test_wrong_settings_are_named(parameter, value):
-    with pytest.raises(calib.BadInputError) as caught:
+    with pytest.raises(calib.BadInputError, match=rf"(?s)^`{parameter}`: ((?!--).)*$"):
         calib.fit(ranges(300), **{"loss": "mixture", parameter: value})
-    assert caught.value.parameter == parameter
-    assert str(caught.value).startswith(f"`{parameter}`: ")
-    assert "--" not in str(caught.value)
 
 
 def test_numpy_numbers_are_numbers():
-    r = ranges(600)
-    plain = calib.fit(r, loss="cauchy", scale_ns=0.1, fixed_ns={1: -0.36}, groups={"a": (1, 2), "b": (3, 7)})
+    plain: dict[str, Any] = {"scale_ns": 0.1, "fixed_ns": {1: -0.36}, "groups": {"a": (1, 2), "b": (3, 7)}}
     numbers: dict[str, Any] = {
         "scale_ns": np.float64(0.1),
         "fixed_ns": {np.int64(1): np.float64(-0.36)},
         "groups": {"a": np.array([1, 2]), "b": np.array([3, 7])},
     }
-    assert calib.fit(r, loss="cauchy", **numbers).calibration.to_json() == plain.calibration.to_json()
+    one, other = (
+        calib.fit(ranges(600), loss="cauchy", **settings).calibration.to_json() for settings in (plain, numbers)
+    )
+    assert one == other
 
 
 # A new tag from calibrated tags.
@@ -236,13 +242,10 @@ def test_new_tags_that_cannot_be_added_are_refused(known, tag, loss, changes, er
 
 
 @pytest.mark.parametrize("loss", ["cauchy", "huber", "soft_l1", "l2"])
-def test_weight_and_slope_are_derivatives_of_one_score(loss):
-    u = np.array([-4.0, -1.5, -0.5, 0.0, 0.3, 0.9, 2.5])
-    weight, slope = LOSSES[loss].weights(u)
-    step = 1e-6
-    score = [(LOSSES[loss].weights(u + s)[0]) * (u + s) for s in (-step, step)]
-    np.testing.assert_allclose((score[1] - score[0]) / (2 * step), slope, atol=1e-6)
-    assert np.all(weight > 0)
+def test_losses_pass_the_check_of_registered_ones(loss):
+    """Its slopes are compared with differences of the score."""
+    register_loss("again", LOSSES[loss].weights)
+    LOSSES.remove("again")
 
 
 def welsch(u):
@@ -259,14 +262,13 @@ def own_loss():
 
 def test_registered_losses_are_fitted(own_loss):
     r = ranges(3000)
-    result = calib.fit(r, loss=own_loss)
-    assert result.calibration.loss == "welsch"
-    matrix, alone = design(r, r.tags()), calib.fit(r, loss=own_loss, scale_ns=0.1, delays_only=True)
-    u = alone.residuals_m / (0.1 * SPEED_OF_LIGHT * 1e-9)
+    found, alone = calib.fit(r, loss=own_loss).calibration, calib.fit(r, loss=own_loss, scale_ns=0.1, delays_only=True)
+    assert found.loss == "welsch"
+    matrix, u = design(r, r.tags()), alone.residuals_m / (0.1 * SPEED_OF_LIGHT * 1e-9)
     # At the optimum of this loss only, its scores sum to zero.
     assert np.abs(matrix.T @ (u * np.exp(-(u**2) / 2))).max() < 0.1 * np.abs(matrix.T @ (u / (1 + u**2))).max()
     # A common shift of all is the constant of the curve; 50 ps are five standard errors.
-    np.testing.assert_allclose(about_their_mean(result.calibration, DELAYS_NS)[0], 0, atol=0.05)
+    np.testing.assert_allclose(about_their_mean(found, DELAYS_NS)[0], 0, atol=0.05)
 
 
 @pytest.mark.parametrize(
@@ -312,8 +314,7 @@ def test_results_print_on_a_screen(result):
     assert max(map(len, lines)) < 120
     for tag, delay in result.calibration.delays_ns.items():
         (line,) = [line for line in lines if line.split()[:1] == [str(tag)]]
-        assert f"{delay:+.4f}" in line
-        assert f"± {1.959964 * result.calibration.delays_std_ns[tag]:.4f}" in line
+        assert re.search(rf"\{delay:+.4f} +± {1.959964 * result.calibration.delays_std_ns[tag]:.4f}", line)
     assert "2000 ranges of synthetic: converged after" in lines[0]
     assert lines[-1] == "warning: <b>beware</b> of the dog"
     assert repr(result.calibration) in text
@@ -336,13 +337,120 @@ def test_html_is_escaped(result):
     assert page.count("<tr>") == page.count("</tr>") == 1 + len(DELAYS_NS) + 3
 
 
-def test_results_draw_into_axes(result):
-    from matplotlib import pyplot
-
-    for draw in (result.plot_bias, result.plot_sigma, result.plot_residuals, result.plot_delays):
-        axes = pyplot.figure().subplots()
-        assert draw(axes) is axes
-        assert axes.get_xlabel()
-        assert axes.get_legend()
-    assert result.plot_delays().figure in [pyplot.figure(number) for number in pyplot.get_fignums()]
+@pytest.mark.parametrize("name", ["plot_bias", "plot_sigma", "plot_residuals", "plot_delays"])
+def test_results_draw_into_axes(result, name):
+    axes, draw = pyplot.figure().subplots(), getattr(result, name)
+    assert draw(axes) is axes
+    assert axes.get_xlabel()
+    assert axes.get_legend()
+    assert draw().figure in [pyplot.figure(number) for number in pyplot.get_fignums()]
     pyplot.close("all")
+
+
+# The recipe of the paper, groups of tags, smooth curves, and a search that goes astray.
+
+
+@pytest.mark.slow
+def test_the_joint_fit_is_better_if_power_depends_on_the_pair():
+    # A fit of delays alone takes the effect of a pair's typical power for a delay.
+    slope = 0.2
+    r = ranges(12_000, bias=lambda lifted: slope * lifted)
+    low = (r.initiator == 1) | (r.target == 1)
+    fpp = [np.where(low, power - 6, power) for power in (r.fpp1_dbm, r.fpp2_dbm)]
+    before, after = (lifted_power(one, two, "mean-of-lifted", -82.0) for one, two in ((r.fpp1_dbm, r.fpp2_dbm), fpp))
+    r = replace(r, fpp1_dbm=fpp[0], fpp2_dbm=fpp[1], raw_m=r.raw_m + slope * (after - before))
+    fits = (calib.fit(r, sequential=sequential).calibration for sequential in (False, True))
+    together, after = (np.std(about_their_mean(found, DELAYS_NS)[0]) for found in fits)
+    assert together < 0.02 < after
+
+
+def grouped(r, groups):
+    """Give tags of the second group a bias of the opposite sign."""
+    other = [0.5 * np.isin(ids, groups["second"]) for ids in (r.initiator, r.target)]
+    lifted = lifted_power(r.fpp1_dbm, r.fpp2_dbm, "mean-of-lifted", -82.0)
+    return replace(r, raw_m=r.raw_m - 2 * (other[0] + other[1]) * bias_m(lifted))
+
+
+def test_groups_of_tags_get_their_own_curves():
+    groups = {"first": (1, 2), "second": (3, 7)}
+    c = calib.fit(grouped(ranges(30_000), groups), groups=groups).calibration
+    grid = np.linspace(*c.bias_curve.range, 200)
+    for name, sign in (("first", 1), ("second", -1)):
+        assert np.std(c.groups[name].bias_curve(grid) - (sign * bias_m(grid))) < 0.006, name
+        assert c.groups[name].bias_curve(np.array([1.0]))[0] == pytest.approx(0, abs=1e-9)
+    assert (calib.Calibration.from_json(c.to_json()), json.loads(c.to_json())["schema_version"]) == (c, 2)
+    # A range between the groups has the mean of both curves, which is zero here.
+    r = grouped(ranges(3000, seed=8), groups)
+    applied, mixed = c.apply(r), np.isin(r.initiator, (1, 2)) != np.isin(r.target, (1, 2))
+    assert abs(np.median(applied.corrected_m - r.truth_m)) < 0.02
+    assert np.std((applied.delay_corrected_m - applied.corrected_m)[mixed]) < 0.006
+
+
+@pytest.mark.parametrize("settings", [{}, {"fixed_ns": {1: -0.3}}, {"constants": "pair"}])
+def test_a_reference_power_moves_a_constant_and_corrects_ranges_alike(settings):
+    r = ranges(600)
+    if settings.get("fixed_ns"):
+        # For a single pair, the other delay compensates the constant.
+        r = r[(r.initiator == 1) & (r.target == 2)]
+    plain, stated = (
+        calib.fit(r, sequential=True, reference_power_dbm=dbm, **settings).calibration for dbm in (None, -84.0)
+    )
+    assert stated.bias_curve(np.array([10**-0.2]))[0] == pytest.approx(0, abs=1e-9)
+    assert plain.bias_curve(np.array([10**-0.2]))[0] != pytest.approx(0, abs=1e-3)
+    np.testing.assert_allclose(stated.apply(r).corrected_m, plain.apply(r).corrected_m, atol=1e-6)
+
+
+def test_the_band_contains_the_curve():
+    fits, inside = (calib.fit(ranges(4000, seed=seed)).calibration for seed in range(3)), []
+    for c in fits:
+        grid = np.linspace(*c.bias_curve.range, 50)
+        wrong = c.bias_curve(grid) - bias_m(grid)
+        inside.append(np.abs(wrong - wrong.mean()) < 1.96 * np.asarray(c.band(grid, "bias"), dtype=float))
+    # 150 points, of which about eight per curve are independent: 95 % within 5 % on either side, and a little more for
+    # the reflections that a Cauchy loss does not remove.
+    assert np.mean(inside) > 0.88
+
+
+def test_curvature_is_the_integral_of_squared_second_derivatives():
+    knots = np.concatenate([[0.0] * 4, [0.3, 0.9], [2.0] * 4])
+    # x^3 has the second derivative 6 x, whose square has the integral 96 over (0, 2); lengths are in spans of 2.
+    fine = np.linspace(0, 2, 400)
+    coefficients = np.linalg.lstsq(basis(fine, knots), fine**3, rcond=None)[0]
+    assert coefficients @ curvature(knots) @ coefficients == pytest.approx(96 * 2**3, rel=1e-9)
+
+
+def test_static_spans_are_left_out():
+    r = ranges(6000)
+    still = r.time_ns < 10_000_000_000
+    moving = without_static(replace(r, truth_m=np.where(still, 2.0, r.truth_m)))
+    assert len(moving) == np.count_nonzero(~still)
+    assert moving.excluded == {"static": np.count_nonzero(still)}
+    with pytest.raises(calib.UnanswerableError, match="nothing moves"):
+        without_static(replace(r, truth_m=np.full(len(r), 2.0)))
+
+
+def test_power_that_varies_with_distance_causes_a_warning():
+    assert not any("confounded" in warning for warning in calib.fit(ranges(5000)).warnings)
+    # Lifted power decreases linearly with distance: a curve over power may be an error by distance.
+    r = ranges(5000, bias=lambda lifted: 0.1 * lifted)
+    noise = np.random.default_rng(1).normal(size=(2, len(r))) * 0.01
+    fpp1, fpp2 = -82 + 10 * np.log10(3.0 - 0.45 * r.truth_m + noise)
+    found = calib.fit(replace(r, fpp1_dbm=fpp1, fpp2_dbm=fpp2))
+    assert any("confounded" in warning for warning in found.warnings)
+    assert found.calibration.provenance["warnings"] == found.warnings
+
+
+def test_a_search_that_excludes_a_pair_is_rejected(monkeypatch):
+    found_by, r = known_distances.fit_likelihood, ranges(2000)
+    assert calib.fit(r).calibration.loss == "mixture"
+
+    def lost(model, *words):
+        found = found_by(model, *words)
+        # 75 cm in all ranges of a tag: farther from the robust start than reflections shift a median.
+        return replace(found, residuals=found.residuals + 0.75 * (model.ranges.initiator == 1))
+
+    monkeypatch.setattr(known_distances, "fit_likelihood", lost)
+    assert calib.fit(r).calibration.loss == "cauchy"
+    assert any(
+        "treated all ranges of a pair as reflected" in warning for warning in calib.fit(r, loss="mixture").warnings
+    )

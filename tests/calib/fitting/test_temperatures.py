@@ -17,7 +17,6 @@ from calib.calibration import held_out_line
 from calib.calibration.patterns import TemperatureSlope
 from calib.data.ranges import read_c
 from tests.calib import overhearing
-from tests.calib.c_header import printed
 from tests.processes import refuse, run
 from tests.uwblink.importers.test_table_forms import as_messages, flights, wrapped, write
 from uwblink.importers.guess import guess_map
@@ -180,37 +179,6 @@ def test_faulty_provenance_is_refused_in_a_line(tmp_path, broken, why):
         held_out_line(replace(fitted(WARM, 3), provenance={"held_out": broken}))
 
 
-MAIN = """
-#include <stdio.h>
-#include "calibration.h"
-int main(void)
-{
-    const double celsius[][2] = {{30.0, 24.5}, {30.0, NAN}, {NAN, NAN}};
-    double x, unknown, longer;
-    int k;
-    (void)uwb_correct(1, 0, 0, 1, 2, &x, 0);
-    (void)uwb_errors(0, 0, 1, 2, &x, &x, &x);
-    for (k = 0; k < 3; k++) {
-        longer = uwb_warmth(1, 3, celsius[k][0], celsius[k][1], &unknown);
-        printf("%.17g %.17g ", longer, unknown);
-    }
-    return 0;
-}
-"""
-
-
-def test_the_c_header_states_the_effect_of_temperatures(tmp_path):
-    found = printed(tmp_path, fitted(WARM, 3), MAIN).split()
-    known, blind = fitted(WARM, 3), replace(fitted(WARM, 3), temperatures=())
-    at = (3.0, -85.0, -86.0, 1, 3)
-    plain, expected = blind.correct(*at), list[float]()
-    for celsius in ((30.0, 24.5), (30.0, np.nan), (np.nan, np.nan)):
-        seen = known.correct(*at, temperature_c=celsius)
-        expected += [plain.range_m - seen.range_m, seen.sigma_total_m**2 - plain.sigma_total_m**2]
-    # Temperatures have single precision: 2e-6 K of 30.
-    assert list(map(float, found)) == pytest.approx(expected, abs=1e-8, rel=1e-5)
-
-
 def test_temperatures_lie_between_readings_and_end_half_a_minute_after_the_last():
     table = {"time_ns": np.array([20, 0, 0, 10]) * 10**9, "tag": np.array([1, 1, 2, 1])}
     found = read_c(
@@ -289,9 +257,9 @@ def test_temperatures_of_rows_that_are_messages_are_named_as_not_read(tmp_path):
 )
 def test_readings_of_no_range_and_degrees_fahrenheit_have_a_warning(tag, later_s, celsius, said):
     flight = calib.sample_flight()
-    time_ns, count = flight.exchanges.time_ns, len(flight.exchanges)
-    readings = {"time_ns": time_ns + later_s * 10**9, "tag": np.full(count, tag), "supply_v": np.full(count, np.nan)}
-    readings["temperature_c"] = np.linspace(celsius - 10, celsius + 10, count)
+    count = len(flight.exchanges)
+    readings = {"time_ns": flight.exchanges.time_ns + later_s * 10**9, "tag": np.full(count, tag)}
+    readings |= {"temperature_c": np.linspace(celsius - 10, celsius + 10, count), "supply_v": np.full(count, np.nan)}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         calib.load_ranges(replace(flight, temperature=readings))
@@ -301,13 +269,12 @@ def test_readings_of_no_range_and_degrees_fahrenheit_have_a_warning(tag, later_s
 
 def test_exact_ranges_of_a_data_frame_with_hot_boards_fit_and_warn_at_the_line_of_the_caller():
     rng = np.random.default_rng(3)
-    away = rng.uniform(1, 5, 300)
-    first, next_one = rng.integers(0, 3, 300), rng.integers(1, 3, 300)
+    away, first = rng.uniform(1, 5, 300), rng.integers(0, 3, 300)
     hot = pandas.DataFrame(
         {
             "t": 0.1 * np.arange(300),
             "initiator": first,
-            "target": (first + next_one) % 3,
+            "target": (first + rng.integers(1, 3, 300)) % 3,
             "range": away + 0.1,
             "true": away,
             "fpp1": rng.uniform(-95, -80, 300),
@@ -318,5 +285,5 @@ def test_exact_ranges_of_a_data_frame_with_hot_boards_fit_and_warn_at_the_line_o
     with pytest.warns(calib.errors.TemperatureWarning, match="Fahrenheit") as caught:
         found = calib.fit(hot).calibration
     assert {one.filename for one in caught} == {__file__}
-    assert list(found.delays_ns.values()) == pytest.approx([-0.1 / 0.299702547] * 3, abs=1e-6)
+    assert found.delays_ns == pytest.approx(dict.fromkeys(range(3), -0.1 / 0.299702547), abs=1e-6)
     assert not found.temperatures

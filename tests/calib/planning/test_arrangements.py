@@ -1,5 +1,6 @@
 """Plans of boards that stand still, compared with counting degrees of freedom and with surveys."""
 
+import itertools
 import json
 import math
 
@@ -55,13 +56,8 @@ def test_plans_agree_with_counting(boards, on, count, each, common):
     unit = 1.96 * found.pair_error_m / C_M_PER_NS * 1.05
     assert np.sqrt(np.mean(np.square(list(found.half_ns.values())))) / unit == pytest.approx(each, rel=0.08)
     assert found.common_ns / unit == pytest.approx(common, rel=0.1)
-
-
-def test_one_arrangement_of_eight_in_space_determines_no_delay():
-    found = calib.plan(8, on="space", arrangements=1)
-    assert len(found.undetermined) >= 7
-    assert found.next_best[0].what.startswith("an arrangement with 1 at (")
-    assert found.next_best[0].mean_ns < found.next_best[0].instead_of_ns
+    # The default number of arrangements stops at small gains.
+    assert on == "plane" or 5 <= len(calib.plan(boards, on=on).arrangements) < 12
 
 
 @pytest.mark.parametrize(
@@ -79,11 +75,16 @@ def test_delays_are_undetermined_without_known_facts(boards, settings, undetermi
     assert all(half < 0.4 for tag, half in found.half_ns.items() if tag not in undetermined)
 
 
+def test_one_arrangement_of_eight_in_space_determines_no_delay():
+    found = calib.plan(8, on="space", arrangements=1)
+    assert len(found.undetermined) >= 7
+    assert found.next_best[0].what.startswith("an arrangement with 1 at (")
+    assert found.next_best[0].mean_ns < found.next_best[0].instead_of_ns
+
+
 def test_the_gain_of_a_measured_distance_is_as_predicted():
-    tape = next(
-        best for best in calib.plan(5, on="plane", arrangements=3).next_best if "a measured distance" in best.what
-    )
-    with_it = calib.plan(5, on="plane", arrangements=3, taped=1)
+    without, with_it = (calib.plan(5, on="plane", arrangements=3, taped=taped) for taped in (0, 1))
+    tape = next(best for best in without.next_best if "a measured distance" in best.what)
     mean = math.sqrt(np.mean(np.square(list(with_it.half_ns.values()))))
     assert mean == pytest.approx(tape.mean_ns, rel=0.05)
     assert mean < tape.instead_of_ns
@@ -103,20 +104,13 @@ def test_plans_agree_with_surveys():
     assert found == pytest.approx(np.array([plan.half_ns[t] for t in plan.tags]), rel=0.1)
 
 
-def test_the_default_number_of_arrangements_stops_at_small_gains():
-    found = calib.plan(4)
-    assert 5 <= len(found.arrangements) < 12
-    assert found.undetermined == ()
-
-
 def test_the_command_prints_steps_and_json():
     done = succeed("calib", "plan", "survey", "7,12,3", "--on", "line", "--arrangements", "2")
     found = calib.plan([7, 12, 3], on="line", arrangements=2)
     assert done.stdout.startswith("\n".join(found.steps))
     assert found.steps[-1] == "4. Survey all recordings together, known to be on a line."
     for one, step in zip(found.arrangements, found.steps[1:], strict=False):
-        assert sorted(one.place_m.values()) == [one.place_m[tag] for tag in one.order()]
-        order = list(map(str, one.order()))
+        order = list(map(str, sorted(one.place_m, key=lambda tag: one.place_m[tag])))
         assert f"boards in the order {' '.join(order)}." in step
         line = f"--arrangement {one.name} --known line --order {','.join(order)} --pairs all --rate 50 --duration 30"
         assert f"  uwblink record PORTS {line} -o {one.name}.uwb\n" in done.stdout
@@ -157,22 +151,18 @@ def test_three_boards_in_a_row_are_not_used_if_a_pair_is_mostly_reflected():
 
 def test_reflected_pairs_cost_the_information_of_missing_pairs():
     """Compared with draws over the same arrangements, in which reflected pairs are left out."""
-    rng = np.random.default_rng(5)
+    rng, pairs = np.random.default_rng(5), np.array(list(itertools.combinations(range(6), 2)))
     places = [places_of(rng, 6, 2, 4.0, 0.4) for _ in range(6)]
+    first, second = (np.eye(6)[pairs[:, end]] for end in (0, 1))
     of_draws = []
     for _ in range(30):
         total = np.zeros((6, 6))
         for place in places:
-            rows, steps = [], []
-            for i in range(6):
-                for j in range(i + 1, 6):
-                    if rng.uniform() >= 0.1:
-                        unit = (place[i] - place[j])[:2] / np.linalg.norm(place[i] - place[j])
-                        step = np.zeros((6, 2))
-                        step[i], step[j] = unit, -unit
-                        steps.append(step.ravel())
-                        rows.append(-0.5 * (np.eye(6)[i] + np.eye(6)[j]))
-            wanted, others = np.array(rows), np.array(steps)
+            apart = place[pairs[:, 0], :2] - place[pairs[:, 1], :2]
+            apart /= np.linalg.norm(apart, axis=1, keepdims=True)
+            seen = rng.uniform(size=len(pairs)) >= 0.1
+            wanted, others = -0.5 * (first + second)[seen], np.einsum("pb,pd->pbd", first - second, apart)[seen]
+            others = others.reshape(len(wanted), -1)
             left = wanted - others @ np.linalg.pinv(others) @ wanted
             total += left.T @ left / 0.02**2
         of_draws.append(np.diag(np.linalg.pinv(total)))

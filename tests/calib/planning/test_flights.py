@@ -18,7 +18,7 @@ ANCHORS = (11, 12, 13, 14)
 C_M_PER_NS = 0.299702547
 
 
-def rehearsed(**other):
+def rehearsed(**other: Any) -> Any:
     given: Any = {"robots": ((1, 2), (3, 4)), "anchors": ANCHORS, "seconds": 6.0, "rate_hz": 50.0}
     return reference_motion(FlightPlanSettings(**(given | other)))
 
@@ -44,16 +44,10 @@ def test_noise_alone_informs_by_its_inverse_variance_and_reflected_ranges_by_les
 
 def test_with_everything_known_a_plan_is_a_fit_with_known_distances():
     """If all positions are known exactly, the covariance is that of least squares on delays alone."""
-    given: Any = {"curve": False, "force_std_m_s2": None}
-    seen = flights.flight_of(
-        flight(seconds=8.0),
-        calib.FlightSettings(heading_std_deg=0.0),
-        flights.ExpectedErrors(noise_m=0.04, reflected=0.0),
-        **given,
-    )
-    object.__setattr__(seen.scene.places, "std_m", np.full(len(seen.scene.places.std_m), 1e-5))
-    found = flights.Information(seen)
-    both = np.column_stack([seen.scene.ranges.initiator, seen.scene.ranges.target])
+    exact = planned(flight(seconds=8.0), heading_std_deg=0.0, reflected=0.0, curve=False).flight
+    object.__setattr__(exact.scene.places, "std_m", np.full(len(exact.scene.places.std_m), 1e-5))
+    found = flights.Information(exact)
+    both = np.column_stack([exact.scene.ranges.initiator, exact.scene.ranges.target])
     rows = 0.5 * C_M_PER_NS * (both[:, :, None] == np.array(found.tags)).sum(axis=1)
     assert found.covariance_ns2 == pytest.approx(np.linalg.inv(rows.T @ rows / 0.04**2), rel=0.02, abs=1e-7)
 
@@ -77,19 +71,19 @@ def test_plans_of_similar_flights_agree():
 
 def test_undetermined_delays_are_named_and_measurements_ranked():
     short: Any = {"seconds": 11.0, "rate_hz": 40.0}
-    plan = calib.plan_flight(3, poses_until_s=0.0, **short)
+    plan, seen = calib.plan_flight(3, poses_until_s=0.0, **short), rehearsed(robots=3, anchors=(), **short)
     assert (plan.undetermined, set(plan.half_ns.values())) == ((1, 2, 3, 4, 5, 6), {math.inf})
     told = {best.what: best.mean_ns for best in plan.next_best}
-    assert next(iter(told)) == "positions known for the first 10 s"
     assert [*told.values()] == sorted(told.values())
+    best_ns = 1.96 * mean_ns(seen, poses_until_s=10.0)
+    assert next(iter(told)) == "positions known for the first 10 s"
+    assert plan.next_best[0].mean_ns == pytest.approx(best_ns, rel=0.01)
     elsewhere = next(what for what in told if what.startswith("the delay of tag"))
-    tag = int(elsewhere.split()[4])
     # Every delay is known to 1.5 ns beforehand, and this one to 0.05 ns.
-    guess = np.eye(6) / 1.5**2 + np.diag([0.05**-2 if one == tag else 0.0 for one in range(1, 7)])
-    seen = rehearsed(robots=3, anchors=(), **short)
-    left = np.trace(np.linalg.inv(np.linalg.inv(planned(seen, poses_until_s=0.0).covariance_ns2) + guess)) / 6
+    known = np.eye(6) / 1.5**2
+    known[int(elsewhere.split()[4]) - 1] *= 1 + 1.5**2 / 0.05**2
+    left = np.trace(np.linalg.inv(np.linalg.inv(planned(seen, poses_until_s=0.0).covariance_ns2) + known)) / 6
     assert told[elsewhere] == pytest.approx(1.96 * math.sqrt(left), rel=1e-3)
-    assert 1.96 * mean_ns(seen, poses_until_s=10.0) == pytest.approx(plan.next_best[0].mean_ns, rel=0.01)
 
 
 def test_sought_anchors_stay_open_and_given_ones_do_not():
@@ -266,8 +260,6 @@ def test_wrong_plans_name_the_option(words, named):
 
 def test_four_anchors_more_are_at_known_places_whatever_is_said_of_anchors_that_there_are_not():
     short: Any = {"seconds": 6.0, "rate_hz": 20.0, "poses_until_s": 0.0}
-    given, sought = (calib.plan_flight(2, **short, anchor_places=places) for places in ("given", "sought"))
-    mean = [
-        {best.what: best.mean_ns for best in plan.next_best}["4 anchors at known positions"] for plan in (given, sought)
-    ]
-    assert mean[0] == pytest.approx(mean[1], rel=1e-9)
+    plans = (calib.plan_flight(2, **short, anchor_places=places) for places in ("given", "sought"))
+    told = [{best.what: best.mean_ns for best in plan.next_best}["4 anchors at known positions"] for plan in plans]
+    assert told[0] == pytest.approx(told[1], rel=1e-9)

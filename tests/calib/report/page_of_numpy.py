@@ -21,16 +21,14 @@ class Tables:
     """Tables of a page: rows of the texts of their cells."""
 
     def __init__(self, page):
-        self.tables = []
-        for table in re.findall("<table.*?</table>", page, re.DOTALL):
-            rows = [re.findall("<t[dh][^>]*>(.*?)</t[dh]>", row) for row in table.split("<tr")[1:]]
-            self.tables.append([[unescape(cell).strip() for cell in row] for row in rows])
+        rows = [table.split("<tr")[1:] for table in re.findall("<table.*?</table>", page, re.DOTALL)]
+        cells = re.compile("<t[dh][^>]*>(.*?)</t[dh]>")
+        self.tables = [[[unescape(cell).strip() for cell in cells.findall(row)] for row in table] for table in rows]
 
     def having(self, *cells):
         """Return the one table whose rows contain all of some cells."""
-        found = [t for t in self.tables if all(any(cell in row for row in t) for cell in cells)]
-        assert len(found) == 1, (cells, len(found))
-        return found[0]
+        (found,) = (t for t in self.tables if all(any(cell in row for row in t) for cell in cells))
+        return found
 
     def row(self, *cells):
         """Return the row that starts with the first of some cells, of the table that has them all."""
@@ -46,12 +44,10 @@ def columns(path):
     """Return the exchanges of an exported table as columns."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    found = {name: [row[name] for row in rows] for name in rows[0]}
     whole = ("time_ns", "initiator", "target", "tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
+    found = {name: np.array([row[name] for row in rows], dtype=np.int64) for name in whole}
     numbers = ("truth_m", "fpp1_dbm", "fpp2_dbm")
-    return {name: np.array(found[name], dtype=np.int64) for name in whole} | {
-        name: np.array([float(cell or "nan") for cell in found[name]]) for name in numbers
-    }
+    return found | {name: np.array([float(row[name] or "nan") for row in rows]) for name in numbers}
 
 
 def curve(table, lifted):

@@ -45,8 +45,7 @@ def heading(body, t):
 
 def turn(angle, vector):
     """Rotate a vector (3,) about the vertical by angles (n,)."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.column_stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1], np.full_like(c, vector[2])])
+    return Rotation.from_euler("z", angle[:, None]).apply(vector)
 
 
 def arm(tag, length_m=ARM):
@@ -167,38 +166,26 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
     when = np.arange(0.0, seconds + 1.0, 0.02)
     poses_of: list[Any] = []
     for body in range(3):
-        off = np.radians(wander_deg) * np.sin(2 * np.pi * when / 17.0 + body)
-        flown = since_takeoff(when - half, standing_s)
-        yaw = heading(body, flown) + off
-        upright = np.column_stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)])
+        flown_s = since_takeoff(when - half, standing_s)
+        yaw = heading(body, flown_s) + np.radians(wander_deg) * np.sin(2 * np.pi * when / 17.0 + body)
         tilt = np.radians(tilt_deg) * np.sin(2 * np.pi * when / (11.0 + body) + body)
-        # Tilted about the x axis of the world: the quaternion of the tilt times that of the heading.
-        s, c = np.sin(tilt / 2), np.cos(tilt / 2)
-        upright = np.column_stack([s * upright[:, 3], -s * upright[:, 2], c * upright[:, 2], c * upright[:, 3]])
-        seen = place(body, flown) + shake(body, flown, *shaken) + place_noise_m * rng.normal(size=(len(when), 3))
-        poses_of.append((np.full(len(when), f"robot{body}"), seen, upright, when))
+        # Tilted about the x axis of the world.
+        turned = Rotation.from_euler("x", tilt[:, None]) * Rotation.from_euler("z", yaw[:, None])
+        seen = place(body, flown_s) + shake(body, flown_s, *shaken) + place_noise_m * rng.normal(size=(len(when), 3))
+        poses_of.append((when, np.full(len(when), f"robot{body}"), seen, turned.as_quat()))
     for tag, here in stand.items():
-        two = np.array([0.0, seconds])
         turned = turned_anchor(tag)
-        middle, quaternion = here - turned.apply(MAST), turned.as_quat()
-        poses_of.append((np.full(2, f"anchor{tag}"), np.tile(middle, (2, 1)), np.tile(quaternion, (2, 1)), two))
-    poses = Poses.from_arrays(
-        np.rint(np.concatenate([r[3] for r in poses_of]) * 1e9).astype(np.int64),
-        np.concatenate([r[0] for r in poses_of]),
-        np.concatenate([r[1] for r in poses_of]),
-        np.concatenate([r[2] for r in poses_of]),
-    )
+        two = (np.tile(each, (2, 1)) for each in (here - turned.apply(MAST), turned.as_quat()))
+        poses_of.append((np.array([0.0, seconds]), np.full(2, f"anchor{tag}"), *two))
+    times, names, places, attitudes = map(np.concatenate, zip(*poses_of, strict=True))
+    poses_time_ns = np.rint(times * 1e9).astype(np.int64)
+    poses = Poses.from_arrays(poses_time_ns, names, places, attitudes)
     planted = {str(tag): float(delay[tag]) for tag in [*DELAYS_NS, *stand]}
-    height = {} if height_off_m is None else heights(rng, when, since_takeoff(when - half, standing_s), height_off_m)
-    return Flight(exchanges, poses, tags, distance, {"delays_ns": planted}, height=height, antennas=antenna)
-
-
-def heights(rng, when, flown, off_m):
-    """Return the columns of a recording's table of height readings, 50 per second of each body."""
-    read = [place(body, flown)[:, 2] + off_m + 0.03 * rng.normal(size=len(flown)) for body in range(3)]
-    names = np.repeat([f"robot{body}" for body in range(3)], len(when))
-    return {
-        "time_ns": np.tile(np.rint(when * 1e9).astype(np.int64), 3),
-        "body": names,
-        "height_m": np.concatenate(read),
-    }
+    flown = Flight(exchanges, poses, tags, distance, {"delays_ns": planted}, antennas=antenna)
+    if height_off_m is not None:
+        # 50 readings per second of each body.
+        robots = slice(0, 3 * len(when))
+        up = [place(body, since_takeoff(when - half, standing_s))[:, 2] for body in range(3)]
+        read_m = np.concatenate(up) + height_off_m + 0.03 * rng.normal(size=3 * len(when))
+        flown.height = {"time_ns": poses_time_ns[robots], "body": names[robots], "height_m": read_m}
+    return flown
