@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import uwbsim
-from tests.uwbsim.world.helpers import autocorrelation
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT, Board, raw_range
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.protocols.prediction import predict
@@ -29,6 +28,11 @@ def scenario(places=((0.0, 0.0, 1.0), (4.0, 0.0, 1.0)), tags=({}, {}), **more):
         "tags": [{"id": k + 1, "body": n} | tag for k, (n, tag) in enumerate(zip("ab", tags, strict=True))],
     }
     return uwbsim.load(base | more)
+
+
+def autocorrelation(values, lag):
+    centred = values - values.mean()
+    return np.mean(centred[lag:] * centred[:-lag]) / np.mean(centred**2)
 
 
 def link(world, now=5_000_000):

@@ -10,9 +10,10 @@ import pytest
 
 import uwbsim
 from tests.registered import registered
-from tests.uwbsim.world.helpers import served
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT, Board, Recording, raw_range
 from uwblink.ticks import METRES_PER_TICK
+from uwblink.wire.codec import Decoder
+from uwblink.wire.messages import REPORTS, Overheard
 from uwbsim.protocols.conditions import conditions_of, range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.world.channel import CHANNEL_EFFECTS, ChannelEffect
@@ -222,6 +223,17 @@ def reception(**more):
         },
         more,
     )
+
+
+def served(world):
+    """Range once from tag 1 to tag 2; return the output of the initiator and of the listener, tag 3."""
+    ports = uwbsim.VirtualPorts(world)
+    Board(ports.port(3)).set_passive(True)
+    report = Board(ports.port(1)).range(2)
+    ports.bench.advance(int(ports.bench.env.now) + 50_000_000)
+    heard = b"".join(data for _, tag, data in ports.transfers if tag == 3)
+    (overheard,) = (event for event in Decoder(REPORTS).feed(heard) if isinstance(event, Overheard))
+    return report, overheard
 
 
 def weaken_tag(link, ends):

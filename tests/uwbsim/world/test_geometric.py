@@ -6,7 +6,7 @@ from scipy.integrate import quad
 from scipy.optimize import minimize
 
 import uwbsim
-from tests.uwbsim.world.helpers import autocorrelation
+from tests.uwbsim.world.test_channel import autocorrelation
 from uwblink import raw_range
 from uwbsim.scenario.bodies import Material, Obstacle, Shadow
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
