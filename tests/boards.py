@@ -6,7 +6,7 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
-from uwblink import RangingPlan, record
+from uwblink import Listener, RangingPlan, record
 from uwblink.boards.ports import SerialPort
 from uwbsim import Scenario, VirtualPorts
 from uwbsim.boards.server import FaultsFile, Server
@@ -31,6 +31,17 @@ def record_bench(path, plan=None, ports=None, **more):
     """Record the boards of the bench in virtual time, at 50 exchanges per second unless a plan states another rate."""
     ports = ports or VirtualPorts(bench_scenario())
     return record(ports.names.values(), path, plan or RangingPlan(rate_hz=50.0), using=ports, **more)
+
+
+class After(Listener):
+    """Runs functions after some numbers of turns of the plan."""
+
+    def __init__(self, **what):
+        self.turns, self._what = 0, {int(name[1:]): do for name, do in what.items()}
+
+    def on_turn(self, turn):
+        self.turns += 1
+        self._what.get(self.turns, lambda: None)()
 
 
 @contextmanager

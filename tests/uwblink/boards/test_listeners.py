@@ -51,18 +51,6 @@ def test_listeners_get_messages_bytes_turns_and_faults(tmp_path):
         assert listener.bytes[way] == b"".join(f.data for f in found.frames if f.direction == way)
 
 
-def test_a_listener_that_raises_ends_the_recording_with_everything_before_in_the_file(tmp_path):
-    left = iter(range(19))
-
-    def fail(heard):
-        if isinstance(heard.message, RangeReport) and next(left, None) is None:
-            raise ZeroDivisionError("a mistake of the user's")
-
-    with pytest.raises(ZeroDivisionError):
-        recorded(tmp_path / "f.uwb", fail)
-    assert len(uwblink.load(tmp_path / "f.uwb").exchanges) == 20
-
-
 def damaged(ports, hit):
     """Damage the output of board 1 by the function `hit`."""
     arrived = ports.bench.send
@@ -156,6 +144,24 @@ def test_failures_of_writing_are_reported_within_a_second(live, monkeypatch, err
             time.sleep(0.01)
     with pytest.raises(uwblink.errors.RecordingError, match=str(error)):
         writer.close()
+
+
+def test_a_slow_disk_is_reported_and_a_stopped_recorder_is_not_taken_for_one(live, monkeypatch):
+    plain, later = time.monotonic, [0.0]
+    with writing.RecordingWriter(live) as writer:
+        writer.check()
+        monkeypatch.setattr(time, "monotonic", lambda: plain() + later[0])
+        later[0] = 3 * writing.LONGEST_BACKLOG_S  # Ctrl-Z, and a minute later fg
+        writer.check()
+        writer.on_bytes(5, "port", "in", b"x")
+        monkeypatch.setattr(writer, "_write", lambda: None)
+        with pytest.raises(uwblink.errors.RecordingError, match=r"the disk is 2\d s late"):
+            for _ in range(60):  # the loop asks during all this time
+                later[0] += 0.5
+                writer.check()
+        monkeypatch.undo()
+        writer.behind_s = 0.0
+    assert len(live.frames()) == 1
 
 
 # A recorder that runs for hours needs no more memory than one that runs for seconds, and commits stay equal.

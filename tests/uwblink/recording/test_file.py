@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import duckdb
@@ -13,9 +12,9 @@ import numpy as np
 import pytest
 
 from tests import processes
-from tests.boards import record_bench
+from tests.boards import After, record_bench
 from tests.errors import one_line
-from uwblink import Contents, Exchanges, Listener, Poses, RangingPlan, Recording, Tag, errors, load
+from uwblink import Contents, Exchanges, Poses, RangingPlan, Recording, Tag, errors, load
 from uwblink.recording.schema import TABLES, CirRow, Fault
 from uwblink.twr import COLUMNS
 
@@ -234,26 +233,15 @@ with uwblink.Recording.create(sys.argv[1], live=True) as recording:
 """
 
 
-class Reader(Listener):
-    """Reads the recording in another process after some number of exchanges, until it has `found` them."""
-
-    def __init__(self, path, at):
-        self.path, self.at, self.turns, self.found = path, at, 0, 0
-
-    def on_turn(self, turn):
-        self.turns += turn.report is not None
-        if self.turns == self.at:
-            until_s = time.monotonic() + 60.0  # the writer commits every 0.1 s, and later under load
-            while self.found != self.at and time.monotonic() < until_s:
-                shown = processes.fork("uwblink", "show", "--json", self.path).stdout
-                self.found = json.loads(shown)["counts"]["exchanges"]
-
-
 def test_another_process_reads_what_is_recorded_so_far(tmp_path):
+    """The writer commits every 0.1 s, and later under load."""
     path = tmp_path / "f's.uwb"
-    reader = Reader(path, 100)
+
+    def committed():
+        return json.loads(processes.fork("uwblink", "show", "--json", path).stdout)["counts"]["exchanges"]
+
+    reader = After(t100=lambda: processes.wait_until(lambda: committed() == 100))
     record_bench(path, RangingPlan(rate_hz=100.0), duration_s=2.0, listeners=[reader])
-    assert reader.found == 100
     assert [p.name for p in tmp_path.iterdir()] == [path.name], "no copy, no log is left"
     assert len(load(path).exchanges) > 100
 

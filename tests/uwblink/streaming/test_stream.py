@@ -158,9 +158,12 @@ def test_a_recording_plays_in_its_own_time(flown, clock):
         ({"speed": math.nan}, "`speed`"),
         ({"duration_s": "long"}, "`duration_s`"),
         ({"calibration": "no.json"}, "no.json"),
+        ({"calibration": "empty.json"}, "empty.json"),
     ],
 )
-def test_wrong_arguments_are_refused_before_the_first_range(flown, more, named):
+def test_wrong_arguments_are_refused_before_the_first_range(tmp_path, monkeypatch, flown, more, named):
+    (tmp_path / "empty.json").write_text("{}")
+    monkeypatch.chdir(tmp_path)
     with pytest.raises((uwblink.errors.ArgumentError, uwblink.errors.PlanError), match=named):
         uwblink.stream(flown, **more)
 
@@ -173,15 +176,6 @@ def test_ports_that_are_not_there_and_ranges_that_are_corrected_already(tmp_path
         opened.append_meta({"calibration": {}})
     with pytest.raises(uwblink.errors.ArgumentError, match="already corrected"):
         uwblink.stream(tmp_path / "f.uwb", calibration=calibration)
-
-
-def test_the_command_prints_a_line_a_range(flown, calibration):
-    expected = uwblink.load(flown).exchanges
-    done = processes.succeed("uwblink", "stream", flown, "-c", calibration, "--speed", "inf")
-    rows = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [row["range_m"] for row in rows] == expected.range_m.tolist()
-    assert {"corrected_m", "sigma_m", "clamped"} <= set(rows[0])
-    assert done.stderr == f"{len(rows)} ranges\n"
 
 
 def test_the_commands_refuse_a_calibration_of_other_boards_and_write_nothing(tmp_path, flown, of_two):
@@ -283,10 +277,14 @@ def test_overheard_differences_are_streamed_with_ranges(overheard, tmp_path):
     assert sorted(map(str, live)) == sorted(map(str, found))
 
 
-def test_the_command_prints_differences_in_lines_of_their_own(overheard, calibration):
-    words = ["uwblink", "stream", overheard, "-c", calibration, "--speed", "inf", "--use", "receptions"]
-    rows = [json.loads(line) for line in processes.run(*words).stdout.splitlines()]
-    lines = [list(row) for row in rows if "listener" in row]
+def test_the_command_prints_a_line_a_range_and_differences_in_lines_of_their_own(overheard, calibration):
+    held = uwblink.load(overheard)
+    words = ("-c", calibration, "--speed", "inf", "--use", "receptions")
+    done = processes.succeed("uwblink", "stream", overheard, *words)
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    ranges = [row for row in rows if "listener" not in row]
+    assert [row["range_m"] for row in ranges] == held.exchanges.range_m.tolist()
+    assert {"corrected_m", "sigma_m", "clamped"} <= set(ranges[0])
     names = ["time_ns", "initiator", "target", "listener", "difference_m", "corrected_m", "sigma_m", "shared_m"]
-    assert lines == [names] * len(uwblink.load(overheard).overheard["time_ns"])
-    assert all("range_m" in row for row in rows if "listener" not in row)
+    assert [list(row) for row in rows if "listener" in row] == [names] * len(held.overheard["time_ns"])
+    assert done.stderr.startswith(f"{len(ranges)} ranges")
