@@ -88,33 +88,41 @@ def test_without_noise_the_prediction_is_exact(name):
     assert predict(PROTOCOLS[name], c).mean_m[0] == pytest.approx(error, abs=1e-6)
 
 
-def test_single_sided_bias_is_the_papers():
-    c = world(1, scheduled=300e-6)
-    assert predict(PROTOCOLS["ss"], c).mean_m[0] == pytest.approx(0.4495, abs=0.0005)
-    for name in ("ds", "ds-alt", "ds-sym"):
-        assert abs(predict(PROTOCOLS[name], c).mean_m[0]) < 0.001, name
+BOTH = {"rx_std": 1e-10, "tx_std": 1e-10}
+ONE_SIDED_M2 = (SPEED_OF_LIGHT * 1e-10) ** 2
 
 
-@pytest.mark.parametrize("share", [0.05, 0.2, 1.0])
-def test_double_sided_variance_is_the_papers(share):
-    """1 + r + r^2 times the variance of single-sided ranging, r = dt32/dt53; receive noise alone is half of it."""
-    both = world(1, rx_std=1e-10, tx_std=1e-10, at_once=share * 1538.7e-6)
-    single = (SPEED_OF_LIGHT * 1e-10) ** 2
-    factor = 1 + share + share**2
-    assert predict(PROTOCOLS["ds"], both).variance_m2[0] == pytest.approx(single * factor, rel=1e-3)
-    receive = world(1, rx_std=1e-10, at_once=share * 1538.7e-6)
-    assert predict(PROTOCOLS["ds"], receive).variance_m2[0] == pytest.approx(single * factor / 2, rel=1e-3)
-    assert predict(PROTOCOLS["ss"], both).variance_m2[0] == pytest.approx(single, rel=1e-3)
-
-
-def test_the_alternative_is_neiryncks():
-    """Equal replies halve the weight of each stamp: 3/4 of the single-sided variance (four stamps with half the weight,
-    two with all, for both), and the bias is the flight times the mean skew.
-    """
-    c = world(1, rx_std=1e-10, tx_std=1e-10)
-    single = (SPEED_OF_LIGHT * 1e-10) ** 2
-    assert predict(PROTOCOLS["ds-sym"], c).variance_m2[0] == pytest.approx(0.75 * single, rel=1e-3)
-    assert predict(PROTOCOLS["ds-sym"], world(1, rate=(12e-6, 4e-6))).mean_m[0] == pytest.approx(5 * 8e-6, rel=1e-3)
+@pytest.mark.parametrize(
+    ("name", "values", "mean_m", "variance_m2"),
+    [
+        ("ss", {"scheduled": 300e-6}, pytest.approx(0.4495, abs=0.0005), 0),
+        *((name, {"scheduled": 300e-6}, pytest.approx(0, abs=0.001), 0) for name in ("ds", "ds-alt", "ds-sym")),
+        ("ss", BOTH | {"rate": (0, 0)}, pytest.approx(0, abs=1e-6), pytest.approx(ONE_SIDED_M2, rel=1e-3)),
+        # ICRA 2023: 1 + r + r^2 times the variance of single-sided ranging, r = dt32/dt53; receive noise alone is half.
+        *(
+            (
+                "ds",
+                noise | {"at_once": r * 1538.7e-6},
+                pytest.approx(0, abs=0.001),
+                pytest.approx(part * ONE_SIDED_M2 * (1 + r + r**2), rel=1e-3),
+            )
+            for r in (0.05, 0.2, 1.0)
+            for noise, part in ((BOTH, 1), ({"rx_std": 1e-10}, 0.5))
+        ),
+        # Neirynck: equal replies halve the weight of each stamp, so 3/4 of the single-sided variance (four stamps with
+        # half the weight, two with all, for both), and the bias is the flight times the mean skew.
+        (
+            "ds-sym",
+            BOTH | {"rate": (12e-6, 4e-6)},
+            pytest.approx(5 * 8e-6, rel=1e-3),
+            pytest.approx(0.75 * ONE_SIDED_M2, rel=1e-3),
+        ),
+    ],
+)
+def test_bias_and_variance_are_those_of_the_papers(name, values, mean_m, variance_m2):
+    found = predict(PROTOCOLS[name], world(1, **values))
+    assert found.mean_m[0] == mean_m
+    assert found.variance_m2[0] == variance_m2
 
 
 def test_carrier_noise_adds_half_the_reply_times_it():
@@ -215,38 +223,18 @@ def test_wrong_arguments_are_refused(call, message):
 
 
 WHITE = 0.01e-6
-REPLY_S, UUS_S, COUNT = 305e-6, 512 / 499.2e6, 3000
+REPLY_S, UUS_S = 305e-6, 512 / 499.2e6
 
 
-def scenario(protocol="ds", white_ppm=WHITE * 1e6, uus=1500, **tag):
-    quiet = {"rx_noise_ps": 0.0, "skew_noise_ppm": 0.0, "skew_bias_ppm": 0.0, "quantize": False}
-    places = {"a": (0.0, 0.0, 1.0), "b": (3.0, 0.0, 1.0)}
-    return uwbsim.load(
-        {
-            "run": {"duration_s": COUNT / 100, "seed": 3},
-            "ranging": {
-                "protocol": protocol,
-                "rate_hz": 100.0,
-                "response_delay_uus": uus,
-                "reply": {"model": "fixed", "delay_us": REPLY_S * 1e6},
-            },
-            "radio": quiet,
-            "bodies": [{"name": n, "motion": {"model": "static", "position_m": p}} for n, p in places.items()],
-            "tags": [{"id": k + 1, "body": n, "white_ppm_sqrt_s": white_ppm} | tag for k, n in enumerate(places)],
-        }
-    )
+def with_white_noise(protocol):
+    return bench(protocol, n=3000, seed=3, tag={"white_ppm_sqrt_s": WHITE * 1e6})
 
 
-def errors_m(world):
-    flight = uwbsim.simulate(world, contention=False)
-    return raw_range(flight.exchanges) - flight.truth_m
-
-
-def closed_form_m(protocol, uus=1500):
+def closed_form_m(protocol):
     """Return the standard deviation from phases that change independently over the intervals of the formulas, without
     flights.
     """
-    wait = uus * UUS_S
+    wait = 1500 * UUS_S
     if protocol == "ss":
         # Half of the difference that two clocks gather over the reply.
         return SPEED_OF_LIGHT * WHITE * np.sqrt(2 * wait) / 2
@@ -256,22 +244,23 @@ def closed_form_m(protocol, uus=1500):
 
 @pytest.mark.parametrize("protocol", ["ds", "ss", "ss-cfo", "ds-alt", "ds-sym"])
 def test_prediction_monte_carlo_and_flight_agree(protocol):
-    world = scenario(protocol)
+    world = with_white_noise(protocol)
     conditions = conditions_of(world)
     predicted = np.sqrt(predict(PROTOCOLS[protocol], conditions).pooled()[1])
     assert np.std(range_errors_m(PROTOCOLS[protocol], conditions, 1, 20_000)) == pytest.approx(predicted, rel=0.03)
-    assert np.std(errors_m(world)) == pytest.approx(predicted, rel=0.06)
+    flight = uwbsim.simulate(world, contention=False)
+    assert np.std(raw_range(flight.exchanges) - flight.truth_m) == pytest.approx(predicted, rel=0.06)
 
 
 @pytest.mark.parametrize("protocol", ["ds", "ss"])
 def test_prediction_has_the_closed_form(protocol):
-    found = predict(PROTOCOLS[protocol], conditions_of(scenario(protocol)))
+    found = predict(PROTOCOLS[protocol], conditions_of(with_white_noise(protocol)))
     np.testing.assert_allclose(np.sqrt(found.parts_m2["clocks"]), closed_form_m(protocol), rtol=2e-3)
 
 
 @pytest.mark.slow
 def test_served_boards_lose_as_much():
-    first = Board(uwbsim.VirtualPorts(scenario()).port(1))
+    first = Board(uwbsim.VirtualPorts(with_white_noise("ds")).port(1))
     ranges = [first.range(2).range_m for _ in range(200)]
     # 200 exchanges determine a deviation to 5 %, which includes whole ticks and the grid.
     assert np.std(ranges) == pytest.approx(closed_form_m("ds"), rel=0.15)
