@@ -107,21 +107,24 @@ def with_truth(rows):
 ZEROS = "[antenna_delays]\ntx = 0\nrx = 0\n"
 
 
-@pytest.mark.parametrize("said", ["", "protocol = 'ds'\nbits = 32\n" + ZEROS])
-def test_devices_without_antenna_delays_are_read_beside_true_distances(tmp_path, said):
-    found = read_rows(tmp_path, with_truth(undelayed(flights())), said)
+@pytest.mark.parametrize(
+    ("tags", "text", "ticks"),
+    [
+        ((1, 2, 3), "", 0),
+        ((1, 2, 3), "protocol = 'ds'\nbits = 32\n" + ZEROS, 0),
+        ((1, 2, 3), None, 0),
+        ((), None, PROGRAMMED),
+    ],
+    ids=["no map", "a map", "the guess", "the guess of devices that have them"],
+)
+def test_devices_without_antenna_delays_are_read_beside_true_distances(tmp_path, tags, text, ticks):
+    path = write(tmp_path / "t.csv", with_truth(undelayed(flights(), tags)))
+    found = read_table(path, mapped(tmp_path, guess_map(path).text if text is None else text))
     assert set(found.exchanges.protocol) == {"ds"}
-    assert found.meta["configured_antenna_delay_ticks"] == {"tx": 0, "rx": 0}
+    assert found.meta["configured_antenna_delay_ticks"] == {"tx": ticks, "rx": ticks}
     longer = found.exchanges.range_m - found.exchanges.truth_m
-    assert longer == pytest.approx(2 * PROGRAMMED * AIR / TICKS, abs=1e-6)
-    assert len(found.meta["notes"]) == (not said)
-
-
-def test_guesses_state_missing_antenna_delays(tmp_path):
-    for rows, ticks in ((undelayed(flights()), 0), (flights(), PROGRAMMED)):
-        path = write(tmp_path / "t.csv", with_truth(rows))
-        found = read_table(path, mapped(tmp_path, guess_map(path).text))
-        assert found.meta["configured_antenna_delay_ticks"] == {"tx": ticks, "rx": ticks}
+    assert longer == pytest.approx(2 * (PROGRAMMED - ticks) * AIR / TICKS, abs=1e-6)
+    assert len(found.meta["notes"]) == (text == "")
 
 
 def test_one_device_without_antenna_delays(tmp_path):

@@ -392,34 +392,6 @@ def test_duckdb_may_open_the_named_file_only(tmp_path):
     assert not (tmp_path / "x.csv").exists()
 
 
-@pytest.mark.parametrize(
-    ("text", "fragment"),
-    [
-        ("bits = 33", "bits: found 33"),
-        ("bits = 32.0", "bits: found 32.0"),
-        ("bits = true", "bits: found True"),
-        ('protocol = ["ds"]', "protocol: found ['ds']"),
-        ("layout = {a = 1}", "layout: found {'a': 1}"),
-        ('layout = "tall"', "layout: found 'tall'"),
-        ("[units]\nstamps = -1.0", "units.stamps"),
-        ('[units]\ndistance = "furlong"', "units.distance"),
-        ("within_s = 0", "within_s: found 0"),
-        ('[ids]\n"a" = 70000', "ids.a: found 70000"),
-        ("[antenna_delays]\ntx = 1e9", "antenna_delays.tx"),
-        ("[antenna_delays.tags.x]\ntx = 1", "antenna_delays.tags.x"),
-        ('[columns]\ntx1 = "nothing"', "column 'nothing' is missing"),
-        ('delimiter = "--"', "delimiter: found '--'"),
-        ('[columns]\nevil = "tx1"', "columns.evil: unknown key"),
-        ('each = "x"', "the key each is for JSON lines, bags and logs"),
-    ],
-)
-def test_wrong_maps_are_refused(tmp_path, text, fragment):
-    write(tmp_path / "t.csv", wrapped(flights()))
-    with pytest.raises(errors.ImportTableError, match=one_line(fragment)):
-        import_recording(tmp_path / "t.csv", tmp_path / "o.uwb", map_file=mapped(tmp_path, text))
-    assert not (tmp_path / "o.uwb").exists()
-
-
 @pytest.mark.parametrize(("bits", "counter", "low"), [(32, "wrapped", 0), (40, "signed", -1)])
 def test_the_first_stamp_that_a_counter_cannot_show_is_a_fault(tmp_path, bits, counter, low):
     lowest, rows = low * 2 ** (bits - 1), wrapped(flights(), bits - 1)
