@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import subprocess
 import time
@@ -61,20 +60,6 @@ def files(folder):
     return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
 
 
-@pytest.mark.slow
-def test_a_sweep_says_that_what_was_done_is_kept_and_goes_on_with_it(tmp_path):
-    text = (ROOT / "docs" / "examples" / "sweep.toml").read_text()
-    plan, results = tmp_path / "sweep.toml", tmp_path / "results"
-    plan.write_text(re.sub(r"(?m)^seeds = .*$", "seeds = 400", text))
-    process = started("uwbsim", "sweep", str(plan), "-o", str(results), "--workers", "1")
-    processes.wait_until(lambda: (results / "results.duckdb.wal").exists() or len(files(results)) > 0, process)
-    out, _ = ended(process)
-    assert process.returncode == 130
-    assert "interrupted; finished runs are kept, and --resume continues" in out
-    assert not (results / "results.duckdb.wal").exists(), "the store is closed"
-    assert not (results / "results.csv").exists(), "which is written when all is done"
-
-
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory):
     path = tmp_path_factory.mktemp("flight") / "f.uwb"
@@ -96,26 +81,12 @@ def test_an_interrupted_report_is_reported_and_leaves_no_partial_file(flight, tm
 
 
 @pytest.mark.slow
-def test_an_interrupted_import_prints_one_line_and_leaves_no_file(tmp_path):
-    row = "{0}.25,{1},9,{2:.3f},-80.5,-81.5\n"
-    with (tmp_path / "t.csv").open("w") as file:
-        file.write("time_s,from_id,to_id,range_m,fpp1,fpp2\n")
-        file.writelines(row.format(k, k % 5, 3.25 + k % 7) for k in range(1_200_000))
-    process = started("uwblink", "import", "csv", str(tmp_path / "t.csv"), "-o", str(tmp_path / "t.uwb"))
-    processes.wait_until(lambda: is_working(process), process)
-    time.sleep(0.2)
-    _, err = ended(process)
-    # On a fast machine it may have ended before.
-    assert (process.returncode, err) in ((130, "interrupted\n"), (0, ""))
-    assert files(tmp_path) == (["t.csv"] if process.returncode else ["t.csv", "t.uwb"])
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "words"),
     [
         (signal.SIGTERM, ("uwbsim", "run", "icra2023/test1", "-o", "f.uwb", "--set", "run.duration_s=100")),
         (signal.SIGINT, ("uwblink", "export", "../long.uwb", "--to", "csv", "-o", "f")),
+        (signal.SIGINT, ("uwblink", "import", "csv", "../long.csv", "-o", "f.uwb")),
         (signal.SIGTERM, ("calib", "apply", "../long.uwb", "-c", "../c.json", "-o", "f.uwb")),
     ],
 )
@@ -137,11 +108,13 @@ def test_a_terminated_writer_leaves_no_file(long, tmp_path, words, number):
 
 @pytest.fixture(scope="module")
 def long(tmp_path_factory):
-    """A recording that takes a second to write, and a calibration of its tags."""
+    """A recording and a table that take a second to write, and a calibration of their tags."""
     folder = tmp_path_factory.mktemp("long")
     flight = calib.sample_flight(300_000)
     uwblink.Contents(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags).save(folder / "long.uwb")
     calib.fit(calib.sample_flight(2000)).calibration.save(folder / "c.json")
+    rows = (f"{k}.25,{k % 5},9,{3.25 + k % 7:.3f},-80.5,-81.5\n" for k in range(600_000))
+    (folder / "long.csv").write_text("time_s,from_id,to_id,range_m,fpp1,fpp2\n" + "".join(rows))
     return folder / "long.uwb"
 
 

@@ -1,7 +1,6 @@
 """Motion-capture poses from files, and the offset of their clock."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,8 +18,6 @@ from uwblink.twr import STAMPS
 from uwbsim.boards.server import LivePoses
 from uwbsim.world.world import World
 
-ROOT = Path(__file__).parents[3]
-TEST1 = ROOT / "scenarios" / "icra2023" / "test1.toml"
 HEADER = "time_s,body,x,y,z,qx,qy,qz,qw\n"
 SHIFT_NS = 1_700_000_000_123_456_789
 
@@ -89,7 +86,7 @@ def test_files_without_poses_are_refused(tmp_path, name, text, fragment):
 def flight(tmp_path_factory):
     """A recording in host time without poses, and its motion capture in a file, 3.21 s late."""
     folder = tmp_path_factory.mktemp("flight")
-    scenario = uwbsim.load(TEST1, ["run.duration_s=10"])
+    scenario = uwbsim.load("icra2023/test1", ["run.duration_s=10"])
     simulated = uwbsim.simulate(scenario)
     e = simulated.exchanges
     moved = replace(simulated, poses=simulated.poses[:0], exchanges=replace(e, time_ns=e.time_ns + SHIFT_NS))

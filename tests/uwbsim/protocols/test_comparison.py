@@ -7,7 +7,6 @@ import pytest
 
 import uwbsim
 from tests import pages, processes
-from tests.shared_data import ROOT
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT, raw_range
 from uwblink.pages import figures
 from uwblink.ticks import TICK_S, elapsed
@@ -16,7 +15,7 @@ from uwbsim.protocols.conditions import calibrated, conditions_of, range_errors_
 from uwbsim.protocols.prediction import broadcast_variances_m2, predict
 from uwbsim.scenario.ranging import TURNAROUND_S
 
-TEST1 = ROOT / "scenarios" / "icra2023" / "test1.toml"
+TEST1 = "icra2023/test1"
 ROWS = list(PROTOCOLS.values())
 
 

@@ -1,7 +1,6 @@
 """The Monte Carlo simulation compared with the event loop with its integer stamps, and with theory."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from uwbsim.protocols.conditions import Conditions, conditions_of, range_errors_
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.radio import SIGMA, Radio
 
-SCENARIOS = Path(__file__).parents[3] / "scenarios"
 NAMES = list(PROTOCOLS)
 SOME_SLOW = [pytest.param(name, marks=[] if name in ("ss", "ds") else pytest.mark.slow) for name in NAMES]
 
@@ -32,7 +30,7 @@ def world(count=16_384, **values):
 @pytest.mark.parametrize("name", NAMES)
 def test_without_contention_the_stamps_are_those_of_the_event_loop(name):
     settings = [f"ranging.protocol={name}", "ranging.rate_hz=100", "run.duration_s=10"]
-    scenario = uwbsim.load(SCENARIOS / "icra2023" / "train.toml", settings)
+    scenario = uwbsim.load("icra2023/train", settings)
     loop, columns = uwbsim.simulate(scenario), uwbsim.simulate(scenario, contention=False)
     for column in COLUMNS:
         np.testing.assert_array_equal(getattr(loop.exchanges, column), getattr(columns.exchanges, column), column)
@@ -42,7 +40,7 @@ def test_without_contention_the_stamps_are_those_of_the_event_loop(name):
 @pytest.mark.parametrize("name", SOME_SLOW)
 def test_means_and_variances_are_those_of_integer_stamps(name):
     settings = [f"ranging.protocol={name}", "ranging.rate_hz=100", "run.duration_s=300", "radio.tx_noise_ps=40"]
-    scenario = uwbsim.load(SCENARIOS / "icra2023" / "test1.toml", settings)
+    scenario = uwbsim.load("icra2023/test1", settings)
     flight = uwbsim.simulate(scenario, contention=False)
     exact = raw_range(flight.exchanges) - flight.truth_m
     # The same 30,000 states, so only the noise differs: 300,000 ranges each.
@@ -168,9 +166,8 @@ def test_a_world_of_many_states_meets_each_in_turn():
 # Accepted and refused arguments of comparisons: parameters by name, in one line.
 
 
-NOISELESS = Path(__file__).parents[3] / "scenarios" / "noiseless.toml"
-SHORT = uwbsim.load(NOISELESS, {"run.duration_s": 2.0, "radio.rx_noise_ps": 100.0})
-WITHOUT_EXCHANGES = uwbsim.load(NOISELESS, {"run.duration_s": 0.001})
+SHORT = uwbsim.load("noiseless", {"run.duration_s": 2.0, "radio.rx_noise_ps": 100.0})
+WITHOUT_EXCHANGES = uwbsim.load("noiseless", {"run.duration_s": 0.001})
 
 
 def test_protocols_are_names_rows_or_all():
@@ -185,7 +182,7 @@ def test_protocols_are_names_rows_or_all():
 
 
 def test_a_scenario_may_be_a_file():
-    assert uwbsim.optimum(NOISELESS, "ss").protocol == "ss"
+    assert uwbsim.optimum(uwbsim.shipped_scenarios()["noiseless"], "ss").protocol == "ss"
 
 
 def test_results_print_themselves():

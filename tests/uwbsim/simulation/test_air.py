@@ -1,7 +1,5 @@
 """Frames in the air: durations, collisions, capture, busy boards, and waits."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -18,7 +16,6 @@ from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 
 US = SUBTICKS_PER_SECOND // 1_000_000
 DS = PROTOCOLS["ds"]
-TRAIN = Path(__file__).parents[3] / "scenarios" / "icra2023" / "train.toml"
 
 
 @pytest.mark.parametrize(("length", "us"), [(11, 177.37), (8, 174.29), (28, 194.81), (100, 280.96)])
@@ -179,7 +176,7 @@ def test_an_answer_leaves_at_the_first_grid_point_after_its_latency():
 )
 def test_what_is_one_event_ends_as_message_by_message(monkeypatch, plan, rate_hz, sync_error_ms):
     ranging = {"ranging.plan": plan, "ranging.rate_hz": rate_hz, "ranging.sync_error_ms": sync_error_ms}
-    scenario = load(TRAIN, {"run.duration_s": 10.0, "radio.sensitivity_dbm": -92.0} | ranging)
+    scenario = load("icra2023/train", {"run.duration_s": 10.0, "radio.sensitivity_dbm": -92.0} | ranging)
     quick, single, plain = simulate(scenario), 0, air.Air._alone
 
     def counted(self, number, begin):

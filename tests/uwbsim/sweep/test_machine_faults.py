@@ -192,7 +192,9 @@ def test_a_sweep_that_ends_early_leaves_no_worker_and_goes_on_where_it_was(tmp_p
             os.kill(left, signal.SIGKILL)
     if number == signal.SIGINT:  # Python's resource tracker may report a kill
         (said,) = words.read_text().splitlines()
-        assert "--resume" in said
+        assert "interrupted; finished runs are kept, and --resume continues" in said
+        assert not log.exists(), "the store is closed"
+        assert not (out / "results.csv").exists(), "which is written when all is done"
     with ResultStore.open(out / "results.duckdb") as store:
         before = len(store.done())
     assert 0 < before < p.total
