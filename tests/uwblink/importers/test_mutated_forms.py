@@ -18,13 +18,12 @@ from tests.uwblink.importers.test_forms import (
     lines,
     long_rows,
     prints,
-    table,
     trek,
     wide_rows,
     with_ids,
     with_powers,
 )
-from tests.uwblink.importers.test_table_forms import HEADER, flights, wrapped
+from tests.uwblink.importers.test_table_forms import HEADER, flights, wrapped, write
 from uwblink.errors import ImportTableError
 from uwblink.importers import read_source
 from uwblink.importers.guess import guess_map
@@ -114,7 +113,7 @@ def written(rng, path, rows, value):
         rows = [*rows, dict.fromkeys(rows[0], "") | {next(iter(rows[0])): "mean", value: 3.3}]
     mark, comma = rng.choice([",", ";", "\t"]), rng.random() < 0.2
     text = (lambda v: str(v).replace(".", ",")) if comma and mark != "," else str
-    return table(path.with_suffix(".csv"), rows, mark, rng.random() > 0.1, text)
+    return write(path.with_suffix(".csv"), rows, mark, text, header=rng.random() > 0.1)
 
 
 def mutated_log(rng, path):

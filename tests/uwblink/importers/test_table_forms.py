@@ -56,9 +56,9 @@ def wrapped(rows, bits=32):
     return [{n: v % 2**bits if n in HEADER[3:9] else v for n, v in row.items() if n != "truth"} for row in rows]
 
 
-def write(path, rows, delimiter=",", text=str):
+def write(path, rows, delimiter=",", text=str, header=True):
     names = list(rows[0])
-    lines = [delimiter.join(names), *(delimiter.join(text(row[n]) for n in names) for row in rows)]
+    lines = [delimiter.join(names)] * header + [delimiter.join(text(row[n]) for n in names) for row in rows]
     data = ("\n".join(lines) + "\n").encode()
     path.write_bytes(gzip.compress(data) if path.suffix == ".gz" else data)
     return path

@@ -97,24 +97,24 @@ def ranged(protocol, sign=1.0, carriers=True, warmer_ppm=0.0):
     return uwblink.Exchanges.from_arrays(first, second, **columns, **skews, protocol=np.full(len(pairs), protocol))
 
 
-@pytest.mark.parametrize("protocol", ["ds", "ds-alt"])
-def test_stamps_and_carriers_give_the_planted_skews(protocol):
-    found = {one.pair: one for one in clock_skews(ranged(protocol))}
+@pytest.mark.parametrize(
+    ("protocol", "sign", "said"),
+    [
+        ("ds", 1, "carriers over stamps 1.000, residual 0.00 ppm, same sign"),
+        ("ds-alt", 1, "carriers over stamps 1.000, residual 0.00 ppm, same sign"),
+        ("ds", -1, "OTHER SIGN in 3 of 3 pairs"),
+    ],
+)
+def test_stamps_and_carriers_give_the_planted_skews(protocol, sign, said):
+    found = {one.pair: one for one in clock_skews(ranged(protocol, sign))}
     assert sorted(found) == ["1-2", "1-3", "2-3"]
     for pair, planted in {"1-2": 6.0, "1-3": -2.5, "2-3": -8.5}.items():
         one = found[pair]
         # A tick in two milliseconds is 0.008 ppm.
-        assert (one.stamps_ppm, one.slope) == pytest.approx((planted, 1), abs=0.01)
-        assert (one.carrier_ppm, one.residual_ppm) == pytest.approx((planted, 0), abs=1e-9)
-        assert one.same_sign is True
-    assert skew_summary(list(found.values())) == "carriers over stamps 1.000, residual 0.00 ppm, same sign"
-
-
-def test_opposite_signs_are_stated():
-    found = clock_skews(ranged("ds", sign=-1.0))
-    assert [one.same_sign for one in found] == [False] * 3
-    assert "OTHER SIGN in 3 of 3 pairs" in skew_summary(found)
-    assert "OTHER SIGN" in str(found[0])
+        assert (one.stamps_ppm, one.slope) == pytest.approx((planted, sign), abs=0.01)
+        assert (one.carrier_ppm, one.residual_ppm) == pytest.approx((sign * planted, 0), abs=1e-9)
+        assert one.same_sign is (sign == 1)
+    assert said in skew_summary(list(found.values()))
 
 
 def test_carriers_without_readings_are_left_out():

@@ -248,6 +248,7 @@ def test_of_a_long_plan_what_the_run_lasts_is_flown(tmp_path):
         uwbsim.load(planned(tmp_path, "5.9,1,3\n6.1,3,1\n0.1,4,1\n"), ["run.duration_s=6"])
     ).exchanges
     assert found.initiator.tolist() == [4, 1]
+    np.testing.assert_allclose(found.time_ns * 1e-9, [0.1, 5.9], atol=0.001)
 
 
 def test_common_random_numbers():
