@@ -290,6 +290,11 @@ def test_a_template_of_topics_in_a_map(tmp_path):
             by_map(tmp_path, bag, f'[topics."{topic}"]\n{keys}')
 
 
+def test_topics_named_as_ours_need_no_map(tmp_path):
+    bag = ros2(tmp_path / "b", by_anchor("/uwb/range_7_{}", RANGE, as_range) | HEIGHT | POSES)
+    assert sorted(ends(read_source(bag, importer="bag"))) == sorted((7, r.anchor) for r in PLANT)
+
+
 GUESS = ("uwblink", "import", "guess")
 
 
