@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 import pytest
 
 from uwblink import Listener, RangingPlan, record
-from uwblink.boards.ports import SerialPort
+from uwblink.boards.ports import SerialPort, Terminal
 from uwbsim import Scenario, VirtualPorts
 from uwbsim.boards.server import FaultsFile, Server
 
@@ -58,6 +58,25 @@ def served(scenario=None, faults=None, link_dir=None, **more):
         stop.set()
         thread.join(60)  # under load, a step takes long, and its output must not be closed
         server.close()
+
+
+@contextmanager
+def device(step, link=None):
+    """Serve a device in a thread: `step` acts on its end of the port again and again; yield that end."""
+    terminal, over = Terminal(link), threading.Event()
+
+    def serve():
+        while not over.wait(0.001):
+            step(terminal)
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    try:
+        yield terminal
+    finally:
+        over.set()
+        thread.join(10)
+        terminal.unplug()
 
 
 @contextmanager

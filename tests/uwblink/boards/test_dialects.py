@@ -12,6 +12,7 @@ import pytest
 
 import calib
 import uwblink
+from tests.boards import device
 from tests.processes import refuse, succeed
 from tests.registered import registered
 from uwblink.boards import DIALECTS, Dialect, LivePage, PrintedRange, dialect_of, load_correction
@@ -37,29 +38,20 @@ FORMS = {
 @contextmanager
 def printing(text, *, asked=b"", banner=""):
     """Serve a board that prints a text 25 times a second after it was asked; yield the name of the port."""
-    terminal, end = Terminal(), threading.Event()
+    heard = []
 
-    def run():
-        heard = b""
-        terminal.write(banner.encode())
-        while not end.is_set():
-            heard += terminal.read()
-            if asked in heard:
-                # In two pieces, like lines of a serial port.
-                data = text.encode()
-                terminal.write(data[:9])
+    def step(terminal):
+        heard.append(terminal.read())
+        if asked in b"".join(heard):
+            # In two pieces, like lines of a serial port.
+            for piece in (text[:9], text[9:]):
+                terminal.write(piece.encode())
                 time.sleep(0.01)
-                terminal.write(data[9:])
-            time.sleep(0.03)
+        time.sleep(0.02)
 
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    try:
+    with device(step) as terminal:
+        terminal.write(banner.encode())
         yield terminal.name
-    finally:
-        end.set()
-        thread.join(10)
-        terminal.unplug()
 
 
 def by_log(tmp_path, text, map_text):

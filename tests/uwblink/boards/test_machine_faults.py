@@ -3,9 +3,7 @@
 import itertools
 import os
 import re
-import select
 import subprocess
-import threading
 import time
 import tracemalloc
 from contextlib import contextmanager
@@ -18,9 +16,9 @@ import pytest
 import uwblink
 from benchmarks.hours import AnsweringPort, AnsweringPorts
 from tests import processes
-from tests.boards import After, bench_scenario, record_bench, served
+from tests.boards import After, bench_scenario, device, record_bench, served
 from uwblink.boards.listeners import Progress
-from uwblink.boards.ports import SerialPorts, Terminal
+from uwblink.boards.ports import SerialPorts
 from uwblink.boards.recorder import Recorder
 from uwblink.wire import messages as m
 from uwblink.wire.codec import encode
@@ -186,25 +184,17 @@ CONTROLS = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f]")
 @contextmanager
 def hostile(board, link, said):
     """A device that returns its id when asked, and random bytes for every other command; yields its input."""
-    terminal, over, got, answers = Terminal(link), threading.Event(), [], itertools.cycle(said)
+    got, answers = [], itertools.cycle(said)
 
-    def serve():
-        assert terminal.fileno is not None
-        while not over.is_set():
-            if select.select([terminal.fileno], [], [], 0.05)[0]:
-                got.append(terminal.read())
-                answer = encode(m.IdReport(board)) if b"C01" in got[-1] else next(answers)
-                for at in range(0, len(answer), 1000):
-                    terminal.write(answer[at : at + 1000])
+    def step(terminal):
+        if data := terminal.read():
+            got.append(data)
+            answer = encode(m.IdReport(board)) if b"C01" in data else next(answers)
+            for at in range(0, len(answer), 1000):
+                terminal.write(answer[at : at + 1000])
 
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
+    with device(step, link):
         yield got
-    finally:
-        over.set()
-        thread.join()
-        terminal.unplug()
 
 
 def test_hostile_devices_have_no_effect(tmp_path):

@@ -1,10 +1,9 @@
 """Received data: datagrams at a plain socket, messages at the WebSocket of a viewer."""
 
-import base64
 import contextlib
+import http.client
 import json
 import math
-import os
 import select
 import socket
 import struct
@@ -30,41 +29,26 @@ class FoxgloveClient:
     def __init__(self, url, name=None, origin=None):
         """Connect as a page of an `origin` that uses a `name` for the server."""
         host, port = url.removeprefix("ws://").rsplit(":", 1)
-        self.socket = socket.create_connection((host.strip("[]"), int(port)), timeout=20)
-        key = base64.b64encode(os.urandom(16)).decode()
-        lines = [
-            "GET / HTTP/1.1",
-            f"Host: {name or host}",
-            *([f"Origin: {origin}"] if origin else []),
-            "Upgrade: websocket",
-            "Connection: Upgrade",
-            f"Sec-WebSocket-Key: {key}",
-            "Sec-WebSocket-Version: 13",
-            "Sec-WebSocket-Protocol: foxglove.sdk.v1",
-        ]
-        self.socket.sendall("\r\n".join([*lines, "", ""]).encode())
-        self.data = b""
-        while b"\r\n\r\n" not in self.data:
-            self.data += self.socket.recv(65536)
-        head, self.data = self.data.split(b"\r\n\r\n", 1)
-        self.status = int(head.split()[1])
-
-    def _take(self, count):
-        while len(self.data) < count:
-            more = self.socket.recv(65536)
-            assert more, "the server hung up"
-            self.data += more
-        taken, self.data = self.data[:count], self.data[count:]
-        return taken
+        self.connection = http.client.HTTPConnection(host.strip("[]"), int(port), timeout=20)
+        headers = {
+            "Host": name or host,
+            "Upgrade": "websocket",
+            "Connection": "Upgrade",
+            "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+            "Sec-WebSocket-Version": "13",
+            "Sec-WebSocket-Protocol": "foxglove.sdk.v1",
+        } | ({"Origin": origin} if origin else {})
+        self.connection.request("GET", "/", headers=headers)
+        self.answer = self.connection.getresponse()
+        self.stream = self.answer.fp
 
     def receive(self):
         """Return opcode and payload of the next frame; servers do not mask."""
-        first, length = self._take(2)
-        if length == 126:
-            (length,) = struct.unpack(">H", self._take(2))
-        elif length == 127:
-            (length,) = struct.unpack(">Q", self._take(8))
-        return first & 0x0F, self._take(length)
+        first, length = self.stream.read(2)
+        if length >= 126:
+            size = 2 if length == 126 else 8
+            length = int.from_bytes(self.stream.read(size))
+        return first & 0x0F, self.stream.read(length)
 
     def text(self):
         opcode, payload = self.receive()
@@ -74,18 +58,17 @@ class FoxgloveClient:
     def message(self):
         """Return subscription, time and content of the next message data."""
         opcode, payload = self.receive()
-        assert opcode == 2
         kind, subscription, time_ns = struct.unpack_from("<BIQ", payload)
-        assert kind == 1
+        assert (opcode, kind) == (2, 1)
         return subscription, time_ns, json.loads(payload[13:])
 
     def send(self, document):
         data = json.dumps(document).encode()
-        assert len(data) < 126
-        self.socket.sendall(bytes([0x81, 0x80 | len(data)]) + b"\0\0\0\0" + data)
+        self.connection.sock.sendall(bytes([0x81, 0x80 | len(data)]) + b"\0\0\0\0" + data)
 
     def close(self):
-        self.socket.close()
+        self.answer.close()
+        self.connection.close()
 
 
 ONE = StreamedRange(
@@ -136,13 +119,14 @@ def test_sending_without_receivers_is_no_error(ear):
 def test_viewers_get_a_topic_per_pair_with_schema():
     with FoxgloveServer("0") as server:
         viewer = FoxgloveClient(server.url)
-        assert (viewer.status, viewer.text()["op"]) == (101, "serverInfo")
+        assert (viewer.answer.status, viewer.text()["op"]) == (101, "serverInfo")
         server.send(ONE)
         (channel,) = viewer.text()["channels"]
         assert (channel["topic"], channel["encoding"], channel["schemaName"]) == ("/ranges/10_20", "json", "uwb.Range")
         schema = json.loads(channel["schema"])
         viewer.send({"op": "subscribe", "subscriptions": [{"id": 7, "channelId": channel["id"]}]})
-        while not select.select([viewer.socket], [], [], 0.01)[0]:  # until the server has read the subscription
+        # Until the server has read the subscription.
+        while not select.select([viewer.connection.sock], [], [], 0.01)[0]:
             server.send(ONE)
         subscription, time_ns, content = viewer.message()
         viewer.close()
@@ -180,11 +164,11 @@ def test_viewers_get_a_topic_per_pair_with_schema():
 )
 def test_other_web_sites_get_no_ranges(gated, name, origin, status):
     viewer = FoxgloveClient(gated.url, name, origin)
-    assert viewer.status == status
+    assert viewer.answer.status == status
     if status == 101:
         assert viewer.text()["op"] == "serverInfo"
     else:
-        assert (viewer.data, viewer.socket.recv(100)) == (b"", b""), "the server hung up"
+        assert viewer.stream.read() == b"", "the server hung up"
     viewer.close()
 
 
@@ -205,7 +189,7 @@ def test_wrong_requests_have_no_effect(gated, capfd):
                 b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n",
             )
     viewer = FoxgloveClient(gated.url)
-    assert viewer.status == 101
+    assert viewer.answer.status == 101
     viewer.close()
     assert capfd.readouterr() == ("", "")
 
