@@ -397,7 +397,7 @@ def test_more_rows_than_a_file_can_hold_are_not_read(recording, monkeypatch):
     assert recording.stat().st_size < 3_000_000, "three million rows that are all alike take less than a byte each"
     with Recording.open(recording) as opened:
         assert opened.count("height") == 3_000_000
-    monkeypatch.setattr(store, "ROWS_OF_ANY_FILE", 2_000_000)
+    monkeypatch.setattr(store, "ROWS_OF_ANY_FILE", 1_000_000)
     with pytest.raises(errors.RecordingError, match="table height holds 3000000 rows"):
         Recording.open(recording)
 
