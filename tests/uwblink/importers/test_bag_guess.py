@@ -6,6 +6,7 @@ import json
 import sqlite3
 import struct
 from contextlib import closing, suppress
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,23 +62,17 @@ def header(store, time_ns, *first):
     return types["std_msgs/msg/Header"](*first, stamp, "map")
 
 
-def ros2(path, topics, plugin=StoragePlugin.MCAP):
-    store = store_of(Stores.ROS2_JAZZY)
-    with Writer2(path, version=9, storage_plugin=plugin) as bag:
+def bag_of(path, topics, plugin=StoragePlugin.MCAP):
+    """Write a bag of ROS 1 if the path ends with .bag, else one of ROS 2; return the path."""
+    old = path.suffix == ".bag"
+    store = store_of(Stores.ROS1_NOETIC if old else Stores.ROS2_JAZZY)
+    writer: Any = Writer1(path) if old else Writer2(path, version=9, storage_plugin=plugin)
+    serialize: Any = store.serialize_ros1 if old else store.serialize_cdr
+    with writer as bag:
         for topic, (kind, make) in topics.items():
             connection = bag.add_connection(topic, kind, typestore=store)
-            for time_ns, message in make(store, ()):
-                bag.write(connection, time_ns, store.serialize_cdr(message, kind))
-    return path
-
-
-def ros1(path, topics):
-    store = store_of(Stores.ROS1_NOETIC)
-    with Writer1(path) as bag:
-        for topic, (kind, make) in topics.items():
-            connection = bag.add_connection(topic, kind, typestore=store)
-            for time_ns, message in make(store, (0,)):
-                bag.write(connection, time_ns, store.serialize_ros1(message, kind))
+            for time_ns, message in make(store, (0,) if old else ()):
+                bag.write(connection, time_ns, serialize(message, kind))
     return path
 
 
@@ -88,15 +83,7 @@ def exchanges(store, first):
         yield time_ns + 5, kind(head, a, b, np.array(stamps, dtype=np.uint64), -80.5, float("nan"))
 
 
-def pairs_of_ranges(store, first):
-    for time_ns, (a, b), _, truth in truths():
-        one = store.types["uwb_msgs/msg/Range"]
-        listed = [one(f"anchor{a}", truth * 100, -79.5), one(f"anchor{b}", truth * 200, -78.5)]
-        yield time_ns, store.types["uwb_msgs/msg/Ranges"](header(store, time_ns, *first), listed)
-
-
 EXCHANGES = {"/uwb": ("uwb_msgs/msg/Exchange", exchanges)}
-RANGED = {"/tag/ranges": ("uwb_msgs/msg/Ranges", pairs_of_ranges), **EXCHANGES}
 NAMED = "\n".join(f'{name} = "stamps.{k}"' for k, name in enumerate(("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")))
 
 
@@ -201,17 +188,17 @@ POSES = {"/vrpn_mocap/drone/pose": (POSE, posed)}
 RANGES = by_anchor("/uwb/tag7/range_{}", RANGE, as_range)
 NUMBERS = by_anchor("/tag7/uwb_anchor{}", NUMBER, as_number)
 FORMS = {
-    "Range by anchor": (ros2, RANGES | HEIGHT | POSES, "/uwb/tag7/range_{to_id}", ()),
-    "Range in ROS 1": (ros1, RANGES, "/uwb/tag7/range_{to_id}", ()),
-    "Range without a tag": (ros2, by_anchor("/range/{}", RANGE, as_range), "/range/{to_id}", ("from_id",)),
-    "numbers": (ros2, NUMBERS, "/tag7/uwb_anchor{to_id}", ()),
-    "an array": (ros2, {"/uwb/ranges": ("std_msgs/msg/Float32MultiArray", rounds)}, "/uwb/ranges", ("from_id",)),
-    "lists": (ros2, {"/tag7/uwb": ("uwb_msgs/msg/Ranges", lists)} | POSES, "/tag7/uwb", ()),
-    "fields in mm": (ros1, {"/tag7/uwb": (MINE, of_anchor(None, as_mine))}, "/tag7/uwb", ()),
-    "fields, and Range": (ros2, {"/tag7/uwb": (MINE, of_anchor(None, as_mine))} | RANGES, "/tag7/uwb", ()),
-    "fields without a tag, and Range": (ros2, {"/u": (MINE, of_anchor(None, as_mine))} | RANGES, "/u", ("from_id",)),
-    "JSON": (ros2, {"/tag7/uwb": (TEXT, of_anchor(None, as_text))} | HEIGHT, "/tag7/uwb", ()),
-    "stamps, and Range": (ros2, {"/uwb": (STAMPED, of_anchor(None, as_stamped))} | RANGES, "/uwb", ()),
+    "Range by anchor": ("b", RANGES | HEIGHT | POSES, "/uwb/tag7/range_{to_id}", ()),
+    "Range in ROS 1": ("b.bag", RANGES, "/uwb/tag7/range_{to_id}", ()),
+    "Range without a tag": ("b", by_anchor("/range/{}", RANGE, as_range), "/range/{to_id}", ("from_id",)),
+    "numbers": ("b", NUMBERS, "/tag7/uwb_anchor{to_id}", ()),
+    "an array": ("b", {"/uwb/ranges": ("std_msgs/msg/Float32MultiArray", rounds)}, "/uwb/ranges", ("from_id",)),
+    "lists": ("b", {"/tag7/uwb": ("uwb_msgs/msg/Ranges", lists)} | POSES, "/tag7/uwb", ()),
+    "fields in mm": ("b.bag", {"/tag7/uwb": (MINE, of_anchor(None, as_mine))}, "/tag7/uwb", ()),
+    "fields, and Range": ("b", {"/tag7/uwb": (MINE, of_anchor(None, as_mine))} | RANGES, "/tag7/uwb", ()),
+    "fields without a tag, and Range": ("b", {"/u": (MINE, of_anchor(None, as_mine))} | RANGES, "/u", ("from_id",)),
+    "JSON": ("b", {"/tag7/uwb": (TEXT, of_anchor(None, as_text))} | HEIGHT, "/tag7/uwb", ()),
+    "stamps, and Range": ("b", {"/uwb": (STAMPED, of_anchor(None, as_stamped))} | RANGES, "/uwb", ()),
 }
 
 
@@ -221,8 +208,8 @@ RARER = ("Range in ROS 1", "Range without a tag", "numbers", "fields, and Range"
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in RARER)) for name in FORMS])
 def test_ranges_of_a_bag_come_in_by_its_guess(tmp_path, name):
-    write, topics, template, asked = FORMS[name]
-    found = by_guess(tmp_path, write(tmp_path / ("b.bag" if write is ros1 else "b"), topics), asked)
+    file, topics, template, asked = FORMS[name]
+    found = by_guess(tmp_path, bag_of(tmp_path / file, topics), asked)
     text = (tmp_path / "map.toml").read_text()
     assert f"[topics.{json.dumps(template)}]\n" in text
     assert "header.stamp" not in text, "the time of a message is used"
@@ -244,7 +231,7 @@ def test_both_ids_in_names_of_topics_may_be_words(tmp_path):
         ("/to_{to_id}/{from_id}", "/to_{1}/{0}"),
     ):
         topics = {name.format(*pair): (RANGE, of_anchor(k, as_range)) for k, pair in enumerate(pairs)}
-        bag = ros2(tmp_path / template.replace("/", "_"), topics | HEIGHT)
+        bag = bag_of(tmp_path / template.replace("/", "_"), topics | HEIGHT)
         assert f"[topics.{json.dumps(template)}]\n" in guess_map(bag).text
         got = ends(by_guess(tmp_path, bag))
         assert ({(one, str(other)[-1]) for one, other in got}, len(got)) == (set(pairs), len(PLANT))
@@ -253,8 +240,8 @@ def test_both_ids_in_names_of_topics_may_be_words(tmp_path):
 def test_ids_in_names_of_topics_complete_those_in_messages(tmp_path):
     """Or the id in the names; an id of a robot differs from an id of the anchors in its messages."""
     topics = {f"/robot{k}/uwb": (MINE, of_anchor(k, as_mine)) for k in range(4)}
-    assert set(ends(by_guess(tmp_path, ros2(tmp_path / "fields", topics)))) == {(f"robot{k}", k) for k in range(4)}
-    bag = ros2(tmp_path / "range", by_anchor("/tag1{}/range", RANGE, as_range))
+    assert set(ends(by_guess(tmp_path, bag_of(tmp_path / "fields", topics)))) == {(f"robot{k}", k) for k in range(4)}
+    bag = bag_of(tmp_path / "range", by_anchor("/tag1{}/range", RANGE, as_range))
     assert set(ends(by_guess(tmp_path, bag, ("to_id",)))) == {(10, 7), (11, 7), (12, 7), (13, 7)}
 
 
@@ -263,7 +250,7 @@ def test_topics_that_other_types_resemble_are_listed_with_their_ids(tmp_path):
         f"/uwb/{a}/{b}": (RANGE, of_anchor(k, as_range))
         for k, (a, b) in enumerate([("a", "c"), ("a", "d"), ("b", "c"), ("b", "d")])
     }
-    bag = ros2(tmp_path / "b", topics | {"/uwb/a/status": (TEXT, lambda *_: ())})
+    bag = bag_of(tmp_path / "b", topics | {"/uwb/a/status": (TEXT, lambda *_: ())})
     assert '[topics."/uwb/b/c"]\nfrom_id = "b"\nto_id = "c"\n' in guess_map(bag).text
     found = by_guess(tmp_path, bag)
     assert found.meta["tag_names"] == {"1": "a", "2": "b", "3": "c", "4": "d"}
@@ -275,7 +262,7 @@ NO_TOPIC = r"no topic '/uwb/.*there are /uwb/tag7/b/range_9 \(sensor_msgs"
 
 def test_a_template_of_topics_in_a_map(tmp_path):
     """A placeholder is a part of a name, and the constant of a topic has priority over that of a template."""
-    bag = ros2(tmp_path / "b", RANGES | {"/uwb/tag7/b/range_9": (RANGE, of_anchor(0, as_range))})
+    bag = bag_of(tmp_path / "b", RANGES | {"/uwb/tag7/b/range_9": (RANGE, of_anchor(0, as_range))})
     text = '[topics."/uwb/tag{from_id}/range_{to_id}"]\nfpp2 = -80\n[topics."/uwb/tag7/range_2"]\nfpp2 = -90\n'
     e = by_map(tmp_path, bag, text + '[columns]\nrange_m = "range"\n').exchanges
     assert len(e) == len(PLANT)
@@ -291,7 +278,7 @@ def test_a_template_of_topics_in_a_map(tmp_path):
 
 
 def test_topics_named_as_ours_need_no_map(tmp_path):
-    bag = ros2(tmp_path / "b", by_anchor("/uwb/range_7_{}", RANGE, as_range) | HEIGHT | POSES)
+    bag = bag_of(tmp_path / "b", by_anchor("/uwb/range_7_{}", RANGE, as_range) | HEIGHT | POSES)
     assert sorted(ends(read_source(bag, importer="bag"))) == sorted((7, r.anchor) for r in PLANT)
 
 
@@ -300,7 +287,7 @@ GUESS = ("uwblink", "import", "guess")
 
 def test_the_commands_end_with_true_distances(tmp_path):
     """Each command is the one that the previous command printed."""
-    ros2(tmp_path / "b", RANGES | HEIGHT | POSES)
+    bag_of(tmp_path / "b", RANGES | HEIGHT | POSES)
     anchors = "".join(f"[[anchors]]\nid = {a}\nposition_m = [{a}, 2, 0]\n" for a in range(4))
     (tmp_path / "TAGS.toml").write_text(f'[[tags]]\nid = 7\nbody = "drone"\nlever_arm_m = [0, 0, 0]\n{anchors}')
     said = processes.succeed(*GUESS, "b", "-o", "map.toml", cwd=tmp_path).stdout.splitlines()
@@ -315,7 +302,7 @@ def test_the_commands_end_with_true_distances(tmp_path):
 
 
 def test_without_poses_the_command_prints_possible_commands(tmp_path):
-    ros2(tmp_path / "b", RANGES)
+    bag_of(tmp_path / "b", RANGES)
     said = processes.succeed(*GUESS, "b", "-o", "map.toml", cwd=tmp_path).stdout
     assert all(words in said for words in ("calib survey", "fit_from_ranges", "constants of pairs need true"))
     assert said.splitlines()[1] in (tmp_path / "map.toml").read_text()
@@ -324,7 +311,7 @@ def test_without_poses_the_command_prints_possible_commands(tmp_path):
 
 
 def test_bags_without_ranges_are_refused_with_their_topics(tmp_path):
-    ros2(tmp_path / "b", POSES | HEIGHT)
+    bag_of(tmp_path / "b", POSES | HEIGHT)
     naming = ["/vrpn_mocap/drone/pose", "geometry_msgs/msg/PoseStamped", "/height/drone"]
     processes.refuse(*GUESS, "b", "-o", "map.toml", naming=naming, cwd=tmp_path)
     assert not (tmp_path / "map.toml").exists()
@@ -335,7 +322,7 @@ def test_bags_without_ranges_are_refused_with_their_topics(tmp_path):
 def test_types_that_a_bag_does_not_define_leave_the_others(tmp_path):
     for name, topics in {"both": NUMBERS, "one": {}}.items():
         more = {"/px4/status": (MINE, of_anchor(None, as_mine))}
-        bag = ros2(tmp_path / name, topics | more, StoragePlugin.SQLITE3)
+        bag = bag_of(tmp_path / name, topics | more, StoragePlugin.SQLITE3)
         with closing(sqlite3.connect(bag / f"{name}.db3")) as db, db:
             db.execute("DELETE FROM message_definitions")
     assert len(by_guess(tmp_path, tmp_path / "both").exchanges) == len(PLANT)
@@ -351,7 +338,7 @@ def test_messages_without_ranges_are_one_line(tmp_path, text):
     def texts(store, _):
         return ((START + k * 10**8, store.types[TEXT](text)) for k in range(12))
 
-    bag = ros2(tmp_path / "b", {"/a/{b": (TEXT, texts)})
+    bag = bag_of(tmp_path / "b", {"/a/{b": (TEXT, texts)})
     with pytest.raises(ImportTableError, match=one_line("no topic with ranges")):
         guess_map(bag)
     with suppress(ImportTableError):
@@ -359,7 +346,7 @@ def test_messages_without_ranges_are_one_line(tmp_path, text):
 
 
 def test_without_the_extra_the_error_names_the_package_to_install(tmp_path, monkeypatch):
-    bag = ros2(tmp_path / "b", RANGES)
+    bag = bag_of(tmp_path / "b", RANGES)
     monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
     with pytest.raises(ImportTableError, match=r"pip install 'uwbcal\[bags\]'"):
         guess_map(bag)
@@ -368,9 +355,9 @@ def test_without_the_extra_the_error_names_the_package_to_install(tmp_path, monk
 # Exchanges by a map of the fields of messages.
 
 
-@pytest.mark.parametrize("write", [ros1, ros2])
-def test_exchanges_by_the_fields_of_a_message(tmp_path, write):
-    bag = write(tmp_path / ("b.bag" if write is ros1 else "b"), EXCHANGES)
+@pytest.mark.parametrize("name", ["b.bag", "b"])
+def test_exchanges_by_the_fields_of_a_message(tmp_path, name):
+    bag = bag_of(tmp_path / name, EXCHANGES)
     found = by_map(tmp_path, bag, f'[columns]\nfrom_id = "a"\nto_id = "b"\nfpp1 = "power"\nfpp2 = "odd"\n{NAMED}\n')
     e, expected = found.exchanges, list(truths())
     count = import_recording(bag, tmp_path / "o.uwb", importer="bag", map_file=tmp_path / "map.toml")
@@ -383,21 +370,11 @@ def test_exchanges_by_the_fields_of_a_message(tmp_path, write):
     assert (found.meta["source"], found.meta["imported_from"]) == ("import bag", bag.name)
 
 
-def test_a_list_of_ranges_in_each_message_of_one_topic_of_several(tmp_path):
-    text = 'each = "ranges"\n[topics."/tag/ranges"]\nfrom_id = "drone"\n[units]\ndistance = "cm"\n'
-    text += '[columns]\nto_id = "ranges.anchor"\nrange_m = "ranges.distance"\nrxp2 = "ranges.rssi"\n'
-    found = by_map(tmp_path, ros2(tmp_path / "b", RANGED), text)
-    expected = [factor * row[3] for row in truths() for factor in (1, 2)]
-    np.testing.assert_allclose(found.exchanges.range_m, expected, rtol=1e-12)
-    assert set(found.meta["tag_names"].values()) == {"drone", "anchor4", "anchor7", "anchor9"}
-    assert found.powers["rxp2_dbm"][:2].tolist() == [-79.5, -78.5]
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", r"`map_file` must name the topics.*there are /tag/ranges \(uwb_msgs/msg/Ranges\), /uwb"),
-        ('[topics."/none"]\n', "no topic '/none'; there are /tag/ranges"),
+        ("", r"`map_file` must name the topics.*there are /tag7/uwb \(uwb_msgs/msg/Ranges\), /uwb"),
+        ('[topics."/none"]\n', "no topic '/none'; there are /tag7/uwb"),
         ('each = "ranges"\n[topics."/uwb"]\n', "a message of /uwb has no list 'ranges'"),
         ('[topics."/uwb"]\n', "column 'from_id' is missing; there are header.stamp, header.frame_id, a, b, stamps"),
         ('[topics."/uwb"]\nfrom_id = [1]\n', r"topics\./uwb\.from_id"),
@@ -406,7 +383,7 @@ def test_a_list_of_ranges_in_each_message_of_one_topic_of_several(tmp_path):
 )
 def test_missing_topics_and_fields_are_named(tmp_path, text, said):
     with pytest.raises(ImportTableError, match=said):
-        by_map(tmp_path, ros2(tmp_path / "b", RANGED), text)
+        by_map(tmp_path, bag_of(tmp_path / "b", FORMS["lists"][1] | EXCHANGES), text)
 
 
 def test_other_files_than_bags_are_refused(tmp_path):

@@ -14,7 +14,7 @@ import pytest
 
 from tests.errors import one_line
 from tests.processes import ROOT
-from tests.uwblink.importers.test_table_forms import as_messages, flights, wrapped, write
+from tests.uwblink.importers.test_table_forms import as_messages, flights, imported, wrapped, write
 from uwblink.errors import ImportTableError
 from uwblink.importers import read_source
 from uwblink.importers.guess import guess_map
@@ -337,12 +337,6 @@ def test_forms_are_imported_by_their_guess(tmp_path, name):
 
 
 LONG = "time_s,from_id,to_id,range_m,gt_range_m\n"
-
-
-def imported(tmp_path, text, map_text="", name="t.csv"):
-    (tmp_path / name).write_text(text)
-    (tmp_path / "map.toml").write_text(map_text)
-    return read_source(tmp_path / name, importer="csv", map_file=tmp_path / "map.toml" if map_text else None)
 
 
 @pytest.mark.parametrize("column", ["gt_range_m", pytest.param("fpp1", marks=pytest.mark.slow), "from_x_m"])

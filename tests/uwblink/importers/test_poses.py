@@ -9,8 +9,7 @@ import pytest
 import uwbsim
 from tests import processes
 from tests.errors import one_line
-from uwblink import Contents, Exchanges, Poses, Tag, errors, load
-from uwblink.exporters import export_recording
+from uwblink import Contents, Exchanges, Tag, errors, load
 from uwblink.importers import add_poses
 from uwblink.importers.poses import read_poses
 from uwblink.recording.distances import distances_m
@@ -268,23 +267,21 @@ def test_topics_by_body(tmp_path):
 
 @pytest.fixture
 def recording(tmp_path):
-    """A recording of tag 1 on a car, 2 on a drone and anchor 9, and a trajectory of each body in our format."""
+    """A recording of tag 1 on a car, 2 on a drone and anchor 9, and a trajectory of each body."""
     ids = np.array([[1, 2], [1, 9], [2, 9]] * 5)
     when = np.arange(15) * 100_000_000
     e = Exchanges.from_arrays(ids[:, 0], ids[:, 1], time_ns=when, tx1=[0] * 15, rx1=5, tx2=1005, rx2=3000)
     tags = [Tag(k, body, (0.0, 0.0, 0.0)) for k, body in ((1, "car"), (2, "drone"), (9, "tag9"))]
     for body, x in (("car", 0.0), ("drone", 4.0)):
-        poses = Poses.from_arrays(np.arange(20) * 10**8, body, [[x, 0.0, k / 10] for k in range(20)])
-        Contents(exchanges=e, poses=poses).save(tmp_path / "one.uwb", force=True)
-        export_recording(tmp_path / "one.uwb", tmp_path / body, to="tum")
+        (tmp_path / f"{body}.tum").write_text("".join(f"{k / 10} {x} 0 {k / 10} 0 0 0 1\n" for k in range(20)))
     Contents(exchanges=e, tags=tags).save(tmp_path / "r.uwb")
     return tmp_path / "r.uwb"
 
 
 def test_bodies_without_poses_are_named_whether_some_or_no_ranges_have_both_ends(recording, tmp_path):
     """Of the pairs 1-2, 1-9 and 2-9, car and drone have poses, or none."""
-    places, files = tmp_path / "places.toml", ["--from", f"car={tmp_path / 'car' / 'car.tum'}"]
-    done = processes.run("uwblink", "poses", recording, *files, "--from", f"drone={tmp_path / 'drone' / 'drone.tum'}")
+    places, files = tmp_path / "places.toml", ["--from", f"car={tmp_path / 'car.tum'}"]
+    done = processes.run("uwblink", "poses", recording, *files, "--from", f"drone={tmp_path / 'drone.tum'}")
     assert (done.returncode, done.stderr) == (0, "")
     assert "5 of 15 measurements have a true distance; no poses of tag9" in done.stdout
     places.write_text("".join(f'[[tags]]\nid = {k}\nbody = "{name}"\n' for k, name in ((1, "Car"), (2, "car"))))
@@ -295,7 +292,7 @@ def test_bodies_without_poses_are_named_whether_some_or_no_ranges_have_both_ends
 
 def test_trajectories_of_several_bodies_and_anchors(recording, tmp_path):
     (tmp_path / "places.toml").write_text("[[anchors]]\nid = 9\nposition_m = [0.0, 3.0, 0.0]\n")
-    files = {body: tmp_path / body / f"{body}.tum" for body in ("car", "drone")}
+    files = {body: tmp_path / f"{body}.tum" for body in ("car", "drone")}
     found = add_poses(recording, files, tags_from=tmp_path / "places.toml")
     assert (found.bodies, found.covered, found.exchanges) == (("anchor9", "car", "drone"), 15, 15)
     held = load(recording)
@@ -318,5 +315,5 @@ def test_wrong_anchors_are_refused(recording, tmp_path):
     ):
         (tmp_path / "places.toml").write_text(text)
         with pytest.raises(errors.PlanError, match=one_line(fragment)):
-            add_poses(recording, tmp_path / "car" / "car.tum", body="car", tags_from=tmp_path / "places.toml")
+            add_poses(recording, tmp_path / "car.tum", body="car", tags_from=tmp_path / "places.toml")
     assert not load(recording).poses

@@ -105,6 +105,12 @@ def read_rows(tmp_path, rows, text=None):
     return read_table(write(tmp_path / "t.csv", rows), None if text is None else mapped(tmp_path, text))
 
 
+def imported(tmp_path, text, map_text="", name="t.csv"):
+    """Write a text to a file, and read it with a map of another text if there is one."""
+    (tmp_path / name).write_text(text)
+    return read_table(tmp_path / name, mapped(tmp_path, map_text) if map_text else None)
+
+
 @pytest.mark.parametrize("delimiter", [";", "\t", "|"])
 def test_any_delimiter_with_a_byte_order_mark_comments_and_windows_lines(tmp_path, delimiter, rows):
     path = write(tmp_path / "t.csv", wrapped(rows), delimiter)

@@ -6,7 +6,7 @@ from scipy.integrate import quad
 from scipy.optimize import minimize
 
 import uwbsim
-from tests.uwbsim.world.test_channel import autocorrelation
+from tests.uwbsim.world.test_channel import ONE, ZERO, autocorrelation, link
 from uwblink import raw_range
 from uwbsim.scenario.bodies import Material, Obstacle, Shadow
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
@@ -27,7 +27,6 @@ from uwbsim.world.world import SampledWorld, World
 ROOM = {"min_m": [0.0, 0.0, 0.0], "max_m": [8.0, 6.0, 3.0], "roughness_mm": 0.0}
 A, B = (1.0, 2.0, 1.0), (5.0, 3.5, 1.6)
 WAVELENGTH_M = 299_702_547 / 3993.6e6
-ZERO, ONE = np.array([0]), np.array([1])
 
 
 def scenario(*, places=(A, B), motion=None, scatterers=0, stamp_noise=False, **more):
@@ -53,10 +52,6 @@ def world_paths(world, time_s=0.5):
     length = found.detour_m[0][there] + np.linalg.norm(np.subtract(A, B))
     order = np.argsort(length)
     return length[order], found.amplitude[0][there][order]
-
-
-def link(world, time_s=0.5):
-    return World(world).link(ZERO, ONE, np.array([round(time_s * SUBTICKS_PER_SECOND)]))
 
 
 def test_noiseless_stays_exact():
