@@ -17,7 +17,7 @@ import uwblink
 import uwbsim
 from tests.fuzz.mutations import BINARY, JSON, TEXT, Mutation
 from tests.uwblink.importers import test_forms
-from tests.uwblink.importers import test_pose_exports as poses
+from tests.uwblink.importers import test_poses as poses
 from uwblink.exporters import export_recording
 
 ROOT: Final = Path(__file__).parents[2]

@@ -262,10 +262,6 @@ def test_damage_other_messages_and_the_bytes_of_an_unfinished_one_are_decoded_ag
 # Listeners of a recorder, in virtual time: they receive all that is written to the file.
 
 
-def recorded(path, *listeners, ports=None, seconds=2.0):
-    return record_bench(path, None, ports, duration_s=seconds, listeners=listeners)
-
-
 class Everything(uwblink.Listener):
     def __init__(self):
         self.bytes, self.turns, self.faults = {"in": b"", "out": b""}, [], []
@@ -282,7 +278,7 @@ class Everything(uwblink.Listener):
 
 def test_listeners_get_messages_bytes_turns_and_faults(tmp_path):
     ports, listener, heard = VirtualPorts(bench_scenario(), lost_share=0.4), Everything(), list[uwblink.Heard]()
-    done = recorded(tmp_path / "f.uwb", listener, heard.append, ports=ports, seconds=2.0)
+    done = record_bench(tmp_path / "f.uwb", None, ports, duration_s=2.0, listeners=[listener, heard.append])
     reports = [(h.board, h.message.tx1) for h in heard if isinstance(h.message, RangeReport)]
     good = sum(turn.report is not None for turn in listener.turns)
     assert good == len(reports) == done.exchanges < done.tried == len(listener.turns)

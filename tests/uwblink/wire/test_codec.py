@@ -365,13 +365,6 @@ def test_one_percent_of_damaged_bytes(seed):
     assert len(found) <= min(len(sent), len(intact) + 0.5 * touched.sum())
 
 
-def test_random_bytes_make_no_message():
-    decoder = Decoder(m.REPORTS)
-    events = decoder.feed(np.random.default_rng(7).bytes(200_000)) + decoder.finish()
-    assert {type(event) for event in events} == {m.Skipped}
-    assert (decoder.messages, decoder.skipped_bytes) == (0, 200_000)
-
-
 # A registered message: declared once, then written and read like those of the boards.
 
 
