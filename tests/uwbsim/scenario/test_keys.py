@@ -19,7 +19,7 @@ from uwblink.database import write_tables
 from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT
 from uwblink.twr import COLUMNS, delay_weights, raw_range
 from uwbsim.boards.server import FaultsFile
-from uwbsim.scenario import copy_scenarios, listed, shipped_scenarios
+from uwbsim.scenario import copy_scenarios, shipped_scenarios
 from uwbsim.scenario.base import BY_UNIT, check_limits
 from uwbsim.sweep.design import SweepFile
 from uwbsim.world.world import World
@@ -308,13 +308,6 @@ def test_listed_success_counts_failures(tmp_path):
 
 
 # Scenarios of the package by name: found, listed, copied.
-
-
-def test_every_scenario_has_a_description():
-    told = listed()
-    assert list(told) == list(shipped_scenarios()) == sorted(told)
-    assert all(4 < len(text) < 200 for text in told.values())
-    assert len(set(told.values())) == len(told), "two are told of alike"
 
 
 def test_names_of_scenarios_replace_missing_files(tmp_path, monkeypatch):
