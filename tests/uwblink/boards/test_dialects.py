@@ -5,7 +5,6 @@ import math
 import threading
 import time
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 import pytest
@@ -198,18 +197,22 @@ def test_the_page_shows_printed_ranges_and_their_corrections(tmp_path):
     correct = load_correction(calibrated(tmp_path, 40, 6018))
     one, other = BOTH.splitlines(keepends=True)
     with printing(one) as port, LivePage(tmp_path / "r.uwb", correct=correct) as page:
-        how: dict[str, Any] = {"ids": [40], "duration_s": 1.0, "watch": page.watch, "listeners": [page]}
-        done = uwblink.boards.record_printed([port], tmp_path / "r.uwb", dialect_of("arduino"), **how)
+        done = uwblink.boards.record_printed(
+            [port], tmp_path / "r.uwb", dialect_of("arduino"), ids=[40], duration_s=1.0, watch=page.watch,
+            listeners=[page],
+        )  # fmt: skip
         body = page.body()
     assert f"{done.exchanges} ranges of 2 devices" in str(done)
     for text in ("40&nbsp;&rarr;&nbsp;6018", "<td>1.000</td><td>0.750</td>", 'polyline class="corrected"'):
         assert text in body
     # There is no share of successful exchanges, because failed ones are not printed.
     assert "%" not in body
-    with printing(other) as port, LivePage(tmp_path / "s.uwb", correct=correct) as page:
-        how = {"ids": [40], "duration_s": 30, "watch": page.watch, "listeners": [page]}
-        with pytest.raises(uwblink.errors.PlanError, match="6019"):
-            uwblink.boards.record_printed([port], tmp_path / "s.uwb", dialect_of("arduino"), **how)
+    said = pytest.raises(uwblink.errors.PlanError, match="6019")
+    with printing(other) as port, LivePage(tmp_path / "s.uwb", correct=correct) as page, said:
+        uwblink.boards.record_printed(
+            [port], tmp_path / "s.uwb", dialect_of("arduino"), ids=[40], duration_s=30, watch=page.watch,
+            listeners=[page],
+        )  # fmt: skip
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -121,8 +120,10 @@ def test_an_unplugged_board_leaves_the_others_running_and_resumes(tmp_path):
     path = tmp_path / "f.uwb"
     with served(link_dir=tmp_path / "ports") as server:
         cable = Unplugging(server)
-        how: Any = {"duration_s": 60.0, "passive": True, "listeners": [cable], "stop": lambda: cable.back > 30}
-        record(server.names.values(), path, RangingPlan(rate_hz=100.0), **how)
+        record(
+            server.names.values(), path, RangingPlan(rate_hz=100.0), duration_s=60.0, passive=True, listeners=[cable],
+            stop=lambda: cable.back > 30,
+        )  # fmt: skip
     found = load(path)
     e, heard = found.exchanges, found.overheard
     (out,), (back,) = ([f.time_ns for f in found.faults if f.kind == kind] for kind in ("unplugged", "replugged"))

@@ -477,7 +477,7 @@ def test_others_messages_in_chunks_by_a_map(tmp_path, compressed):
     np.testing.assert_allclose(found.range_m, 1 + np.arange(50) / 1000, atol=1e-12)
 
 
-def posed(x=1.0, sec=1):
+def in_frame(x=1.0, sec=1):
     pose = {"position": {"x": x, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
     return {"timestamp": {"sec": sec, "nsec": 0}, "pose": pose}
 
@@ -489,9 +489,9 @@ def posed(x=1.0, sec=1):
         (b"[" * 100_000, "is not JSON"),
         ([1], "is not an object of JSON"),
         ({"timestamp": 3, "pose": {}}, "is no foxglove.PoseInFrame"),
-        (posed(x="here"), "is no foxglove.PoseInFrame"),
-        (posed(x=float("nan")), "is no foxglove.PoseInFrame"),
-        (posed(sec=10**30), "is no foxglove.PoseInFrame"),
+        (in_frame(x="here"), "is no foxglove.PoseInFrame"),
+        (in_frame(x=float("nan")), "is no foxglove.PoseInFrame"),
+        (in_frame(sec=10**30), "is no foxglove.PoseInFrame"),
     ],
 )
 def test_wrong_poses_are_one_line(tmp_path, message, said):

@@ -162,13 +162,19 @@ def exchanges(both):
     return uwblink.load(both / "both.uwb").exchanges
 
 
-def test_each_exchange_is_kept_once(both, exchanges):
-    found = single_reports(exchanges)
+def test_show_calibration_and_doctor_count_each_exchange_once(both, exchanges):
     count = len(set(zip(exchanges.tx1.tolist(), exchanges.rx2.tolist(), strict=True)))
-    assert (len(found.exchanges), len(found.differing)) == (count, 0)
-    assert found.repeated == len(exchanges) - count > 75
-    mine = found.exchanges.reporter == found.exchanges.initiator
-    assert mine.all(), "every target's report follows one of the initiator's"
+    with uwblink.Recording.open(both / "both.uwb") as recording:
+        summary = summarize(recording)
+        failed = sum("failed" in fault.kind for fault in recording.faults())
+    assert summary.counts["exchanges"] == sum(p.exchanges for p in summary.pairs) == count
+    assert sum(p.failed for p in summary.pairs) == failed > 0
+    assert summary.reported_twice == len(exchanges) - count > 75
+    assert summary.contradictory == 0
+    assert len(calib.load_ranges(both / "both.uwb")) == count
+    assert not any("contradicting" in finding.fault for finding in calib.examine(both / "both.uwb"))
+    kept = single_reports(exchanges).exchanges
+    assert np.all(kept.reporter == kept.initiator), "every target's report follows one of the initiator's"
     one = uwblink.load(both / "one.uwb").exchanges
     assert single_reports(one).exchanges is one
 
@@ -196,18 +202,6 @@ def test_equal_stamps_of_another_time_are_another_exchange(exchanges):
     later = replace(once, reporter=once.target, time_ns=once.time_ns + 70_000_000)
     columns: dict[str, Any] = {n: np.concatenate([getattr(once, n), getattr(later, n)]) for n in COLUMNS}
     assert single_reports(replace(once, **columns)).repeated == 0
-
-
-def test_show_calibration_and_doctor_count_it_once(both):
-    with uwblink.Recording.open(both / "both.uwb") as recording:
-        summary = summarize(recording)
-        exchanges = single_reports(recording.exchanges()).exchanges
-        failed = sum("failed" in fault.kind for fault in recording.faults())
-    assert summary.counts["exchanges"] == sum(p.exchanges for p in summary.pairs) == len(exchanges)
-    assert sum(p.failed for p in summary.pairs) == failed > 0
-    assert (summary.reported_twice > 75, summary.contradictory) == (True, 0)
-    assert len(calib.load_ranges(both / "both.uwb")) == len(exchanges)
-    assert not any("contradicting" in finding.fault for finding in calib.examine(both / "both.uwb"))
 
 
 def test_the_doctor_names_reports_that_contradict_each_other(both, exchanges, tmp_path):

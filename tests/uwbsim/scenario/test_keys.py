@@ -4,7 +4,6 @@ import json
 import re
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -325,9 +324,8 @@ def test_names_of_scenarios_replace_missing_files(tmp_path, monkeypatch):
     ):
         with pytest.raises(uwbsim.ScenarioError, match=said):
             uwbsim.load(wrong)
-    number: Any = 3
     with pytest.raises(uwbsim.UwbsimError, match="`source`: found int, expected a path, a name"):
-        uwbsim.simulate(number)
+        uwbsim.simulate(3)  # type: ignore[arg-type]
 
 
 def test_copies_run_on_their_own(tmp_path):
