@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,7 +58,7 @@ def world(duration_s=60.0, seed=5, rate_hz=150.0, radio=None, **more):
 def known(scenario):
     """Return a calibration with the planted values, as JSON."""
     planted = uwbsim.load(scenario).planted()
-    curve = planted["bias_curve"] or LINE
+    curve: dict[str, Any] = planted["bias_curve"] or LINE
     shape = curve | {"range": [curve["knots"][0], curve["knots"][-1]]}
     return {
         "schema_version": 3,
