@@ -27,12 +27,14 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-EXCHANGE = "std_msgs/Header header\nuint16 a\nuint16 b\nuint64[6] stamps\nfloat32 power\nfloat64 odd\n"
-ONE_OF_LIST = "string anchor\nfloat64 distance\nfloat32 rssi\n"
-LISTS = "std_msgs/Header header\nuwb_msgs/Range[] ranges\n"
-MINES = "std_msgs/Header header\nstring dest\nfloat32 range_mm\nfloat32 rssi\n"
-STAMPS = "std_msgs/Header header\nuint16 src\nuint16 dst\nuint64 tx1\nuint64 rx1\nuint64 tx2\nuint64 rx2\n"
-TYPES = {"Exchange": EXCHANGE, "Range": ONE_OF_LIST, "Ranges": LISTS, "Mine": MINES, "Stamped": STAMPS}
+HEADER = "std_msgs/Header header\n"
+TYPES = {
+    "Exchange": HEADER + "uint16 a\nuint16 b\nuint64[6] stamps\nfloat32 power\nfloat64 odd\n",
+    "Range": "string anchor\nfloat64 distance\nfloat32 rssi\n",
+    "Ranges": HEADER + "uwb_msgs/Range[] ranges\n",
+    "Mine": HEADER + "string dest\nfloat32 range_mm\nfloat32 rssi\n",
+    "Stamped": HEADER + "uint16 src\nuint16 dst\nuint64 tx1\nuint64 rx1\nuint64 tx2\nuint64 rx2\n",
+}
 TICK_M = 299_702_547.0 / (128 * 499_200_000)
 WHEN = 1_706_822_508_042_560_815
 

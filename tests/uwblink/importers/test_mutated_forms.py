@@ -48,17 +48,13 @@ FAMILIES = (
 )
 
 
-def time_scale(name):
-    return 1000.0 if name.endswith("_ms") else 1.0
-
-
 def mutated_long(rng, path):
     unit, time, first, other, name = (rng.choice(list(names)) for names in (UNITS, TIMES, FROM, TO, RANGES))
     header = name + ("" if unit.startswith("?") else unit)
     columns = {"t_s": time, "tag": first, "anchor": other, "range_m": header}
     rows = []
     for row in long_rows():
-        row["t_s"] *= time_scale(time)
+        row["t_s"] *= 1000.0 if time.endswith("_ms") else 1.0
         row["range_m"] = round(row["range_m"] * UNITS[unit], 4)
         rows.append({columns.get(key, key): value for key, value in row.items()})
     if rng.random() < 0.5:

@@ -11,7 +11,6 @@ import pytest
 import uwbsim
 from tests import pages, processes
 from tests.browser import lies_well
-from tests.shared_data import ROOT
 from uwblink import PROTOCOLS
 from uwblink.pages import figures
 from uwblink.ticks import METRES_PER_TICK
@@ -19,9 +18,7 @@ from uwbsim.pages import write_sweep_page
 from uwbsim.pages.figures import error_over, histograms, result_over_keys, room, timing
 from uwbsim.protocols.comparison import ErrorCurve
 
-SCENARIOS = ROOT / "scenarios"
-BENCH, OFFICE = SCENARIOS / "two_boards_on_a_bench/bench.toml", SCENARIOS / "office/office.toml"
-NLOS_OFFICE = SCENARIOS / "nlos_office/office.toml"
+BENCH = "two_boards_on_a_bench/bench"
 
 
 def words(draw):
@@ -30,7 +27,7 @@ def words(draw):
 
 @pytest.mark.parametrize("width", [3.5, 7.16])
 def test_a_room_is_to_scale_within_its_walls(width):
-    scenario = uwbsim.load(OFFICE)
+    scenario = uwbsim.load("office/office")
     with figures.style():
         figure = room(width, scenario)
         figure.draw_without_rendering()
@@ -78,7 +75,7 @@ def test_a_timing_diagram_has_every_interval_with_its_length(name):
 def folder(tmp_path_factory):
     """A scene, and a comparison that replaces an older one, as written by commands."""
     folder = tmp_path_factory.mktemp("pages")
-    processes.succeed("uwbsim", "show", NLOS_OFFICE, "-o", folder / "scene.html")
+    processes.succeed("uwbsim", "show", "nlos_office/office", "-o", folder / "scene.html")
     (folder / "out").mkdir()
     (folder / "out" / "compare.csv").write_text("old")
     done = processes.succeed("uwbsim", "compare", BENCH, "-o", folder / "out", "-n", 300, "--force", "--json")
@@ -152,9 +149,9 @@ def judged(flight):
     ],
 )
 def test_sweeps_draw_their_results_with_labels(tmp_path, kind, more, caption):
-    head = f"sweep = {{ scenario = '{BENCH.as_posix()}', kind = {kind}, protocols = ['ds'], seeds = 3 }}"
+    head = f"sweep = {{ scenario = '{BENCH}', kind = {kind}, protocols = ['ds'], seeds = 3 }}"
     (tmp_path / "plan.toml").write_text(f"{head}\n[vary]\n'radio.rx_noise_ps' = [50.0, 100.0, 200.0]\n{more}\n")
-    design = uwbsim.load_design(tmp_path / "plan.toml", allow_files=[BENCH.parent])
+    design = uwbsim.load_design(tmp_path / "plan.toml")
     uwbsim.run_sweep(design, tmp_path / "out", workers=1, evaluate=judged if "calibrate" in kind else None)
     page = write_sweep_page(design, tmp_path / "out").read_text()
     captions = re.findall("<figcaption>(.*?)</figcaption>", page)

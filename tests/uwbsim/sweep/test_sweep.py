@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from tests.errors import one_line
-from tests.processes import CONTEXT, refuse, succeed, wait_until
+from tests.processes import BIN, CONTEXT, refuse, succeed, wait_until
 from tests.registered import registered
 from uwblink.errors import UwblinkError
 from uwblink.protocols.table import PROTOCOLS
@@ -310,9 +310,6 @@ def test_wrong_sweeps_are_refused(tmp_path, text, fragment):
 # Sweeps during faults of computers: a damaged store, two sweeps in one folder, a scheduler that ends.
 
 
-UWBSIM = str(Path(sys.executable).parent / "uwbsim")
-
-
 @pytest.fixture
 def done(alone, tmp_path):
     p, out = alone
@@ -460,7 +457,7 @@ def signals_blocked(pid):
 def test_a_sweep_that_ends_early_leaves_no_worker_and_goes_on_where_it_was(tmp_path, number):
     p, out, words = plan(tmp_path, HEAD + "ranges = 4_000\nseeds = 8\n" + GRID), tmp_path / "out", tmp_path / "words"
     with words.open("w") as stream:
-        command = [UWBSIM, "sweep", p.path, "-o", out, "--workers", "2"]
+        command = [BIN / "uwbsim", "sweep", p.path, "-o", out, "--workers", "2"]
         process = subprocess.Popen(command, stdout=stream, stderr=stream, start_new_session=True)
     try:
         # The log grows with every result; ten thousand bytes are a few of them.
@@ -494,7 +491,7 @@ def test_a_worker_that_dies_as_it_begins_is_one_line(tmp_path):
     (tmp_path / "p.toml").write_text(ENDLESS)
     (tmp_path / "sitecustomize.py").write_text("import os, sys\nif '--multiprocessing-fork' in sys.argv: os._exit(9)\n")
     env = os.environ | {"PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
-    words = [UWBSIM, "sweep", "p.toml", "-o", "out", "--workers", "2"]
+    words = [BIN / "uwbsim", "sweep", "p.toml", "-o", "out", "--workers", "2"]
     done = subprocess.run(words, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert "--workers" in done.stderr
