@@ -343,20 +343,28 @@ def lines(path, head, table, mark=","):
     return path
 
 
+def angles(turned, order):
+    """Return angles about x, y and z in degrees, of successive rotations about the body's own axes, by elements of the
+    matrix.
+
+    R = Rx(a) Ry(b) Rz(c) or Rz(c) Ry(b) Rx(a), multiplied by hand.
+    """
+    r = turned.as_matrix()
+    if order == "XYZ":
+        found = np.arctan2(-r[1, 2], r[2, 2]), np.arcsin(r[0, 2]), np.arctan2(-r[0, 1], r[0, 0])
+    else:
+        found = np.arctan2(r[2, 1], r[2, 2]), -np.arcsin(r[2, 0]), np.arctan2(r[1, 0], r[0, 0])
+    return np.degrees(found)
+
+
 def motive(folder, version="1.23", unit="Millimeters", labelled=True, rotation="Quaternion"):
     scale = {"Millimeters": 1000.0, "Meters": 1.0}[unit]
     turns = "XYZ" if len(rotation) == 3 else "XYZW"
 
     def numbers(name, k):
         place, turned = BODIES[name][0][k] * scale, BODIES[name][1][k]
-        # Successive rotations about the body's own axes; the columns are of x, y and z in any order of rotations.
-        written = turned.as_quat() if turns == "XYZW" else turned.as_euler(rotation, degrees=True)
-        return [
-            *(written[::-1] if rotation == "ZYX" else written),
-            *place,
-            0.001,
-            *place,
-        ]  # followed by a marker of the body
+        written = angles(turned, rotation) if turns == "XYZ" else turned.as_quat()
+        return [*written, *place, 0.001, *place]  # followed by a marker of the body
 
     kinds = ["Rotation"] * len(turns) + ["Position"] * 3 + ["Mean Marker Error"] + ["Position"] * 3
     axes = [*turns, *"XYZ", "", *"XYZ"]

@@ -491,7 +491,7 @@ def test_a_worker_that_dies_as_it_begins_is_one_line(tmp_path):
     (tmp_path / "p.toml").write_text(ENDLESS)
     (tmp_path / "sitecustomize.py").write_text("import os, sys\nif '--multiprocessing-fork' in sys.argv: os._exit(9)\n")
     env = os.environ | {"PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
-    words = [BIN / "uwbsim", "sweep", "p.toml", "-o", "out", "--workers", "2"]
+    words = [str(BIN / "uwbsim"), "sweep", "p.toml", "-o", "out", "--workers", "2"]
     done = subprocess.run(words, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert "--workers" in done.stderr
