@@ -6,8 +6,8 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
-from uwblink import RangingPlan, record
-from uwblink.boards.ports import SerialPort
+from uwblink import Listener, RangingPlan, record
+from uwblink.boards.ports import SerialPort, Terminal
 from uwbsim import Scenario, VirtualPorts
 from uwbsim.boards.server import FaultsFile, Server
 
@@ -33,6 +33,17 @@ def record_bench(path, plan=None, ports=None, **more):
     return record(ports.names.values(), path, plan or RangingPlan(rate_hz=50.0), using=ports, **more)
 
 
+class After(Listener):
+    """Runs functions after some numbers of turns of the plan."""
+
+    def __init__(self, **what):
+        self.turns, self._what = 0, {int(name[1:]): do for name, do in what.items()}
+
+    def on_turn(self, turn):
+        self.turns += 1
+        self._what.get(self.turns, lambda: None)()
+
+
 @contextmanager
 def served(scenario=None, faults=None, link_dir=None, **more):
     """Serve a scenario in a thread; yield the server."""
@@ -47,6 +58,25 @@ def served(scenario=None, faults=None, link_dir=None, **more):
         stop.set()
         thread.join(60)  # under load, a step takes long, and its output must not be closed
         server.close()
+
+
+@contextmanager
+def device(step, link=None):
+    """Serve a device in a thread: `step` acts on its end of the port again and again; yield that end."""
+    terminal, over = Terminal(link), threading.Event()
+
+    def serve():
+        while not over.wait(0.001):
+            step(terminal)
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    try:
+        yield terminal
+    finally:
+        over.set()
+        thread.join(10)
+        terminal.unplug()
 
 
 @contextmanager

@@ -35,7 +35,6 @@ LONGEST: Final = (
     "tests/calib/checks/test_checks.py",
     "tests/uwblink/boards/test_live_page.py",
     "tests/calib/data/test_sources.py",
-    "tests/uwblink/recording/test_intake.py",
     "tests/calib/fitting/test_fitting.py",
     "tests/calib/fitting/test_sessions.py",
     "tests/calib/report/test_files.py",

@@ -119,7 +119,7 @@ SAME = {
 
 ELSEWHERE = {
     "uwblink stream --output": "test_full_disk.py",
-    "uwbsim sweep --output": "uwbsim/sweep/test_machine_faults.py",
+    "uwbsim sweep --output": "uwbsim/sweep/test_sweep.py",
     "uwblink cir --plot": "test_full_disk.py",
 }
 """Outputs with a full disk in other tests: the sweep keeps finished runs, the recorder its recorded rows."""

@@ -16,7 +16,7 @@ import pytest
 
 from tests import pages, processes
 from tests.errors import one_line
-from tests.uwblink.test_register_protocol import SYMMETRIC, TARGETS
+from tests.uwblink.test_twr import SYMMETRIC, TARGETS
 from tests.uwbsim.simulation.test_protocols import bench
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT, Recording, load, register_protocol
 from uwblink.errors import ArgumentError, PluginWarning

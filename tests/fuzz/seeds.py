@@ -16,8 +16,8 @@ import calib
 import uwblink
 import uwbsim
 from tests.fuzz.mutations import BINARY, JSON, TEXT, Mutation
-from tests.uwblink.importers import test_forms
-from tests.uwblink.importers import test_pose_exports as poses
+from tests.uwblink.importers import test_forms, test_table_forms
+from tests.uwblink.importers import test_poses as poses
 from uwblink.exporters import export_recording
 
 ROOT: Final = Path(__file__).parents[2]
@@ -239,7 +239,7 @@ def _write_tables(folder: Path) -> None:
 def _write_forms(folder: Path) -> None:
     """Write files of other forms, and their maps, as the tests of these forms do."""
     constants = "[constants]\nfrom_id = 7\n"
-    test_forms.table(folder / "form_wide.csv", test_forms.wide_rows("r_AN{}"))
+    test_table_forms.write(folder / "form_wide.csv", test_forms.wide_rows("r_AN{}"))
     (folder / "form_wide.toml").write_text('missing = [-1, "x"]\n[columns]\ntime_s = "t_s"\nfrom_id = "tag"\n' + WIDE)
     test_forms.lines(folder / "form_uart.log", test_forms.lec)
     (folder / "form_log.toml").write_text(f'line = "dwm1001-lec"\nchip = "dw1000"\n{constants}')

@@ -5,19 +5,19 @@ import math
 import threading
 import time
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 import pytest
 
 import calib
 import uwblink
+from tests.boards import device
 from tests.processes import refuse, succeed
 from tests.registered import registered
+from tests.uwblink.importers.test_table_forms import imported
 from uwblink.boards import DIALECTS, Dialect, LivePage, PrintedRange, dialect_of, load_correction
 from uwblink.boards.dialects import Printed
 from uwblink.boards.ports import Terminal
-from uwblink.importers import read_source
 from uwblink.importers.devices import LINES
 
 # Output of each board for a range of one metre to one device and of two metres to another, from descriptions.
@@ -37,36 +37,20 @@ FORMS = {
 @contextmanager
 def printing(text, *, asked=b"", banner=""):
     """Serve a board that prints a text 25 times a second after it was asked; yield the name of the port."""
-    terminal, end = Terminal(), threading.Event()
+    heard = []
 
-    def run():
-        heard = b""
-        terminal.write(banner.encode())
-        while not end.is_set():
-            heard += terminal.read()
-            if asked in heard:
-                # In two pieces, like lines of a serial port.
-                data = text.encode()
-                terminal.write(data[:9])
+    def step(terminal):
+        heard.append(terminal.read())
+        if asked in b"".join(heard):
+            # In two pieces, like lines of a serial port.
+            for piece in (text[:9], text[9:]):
+                terminal.write(piece.encode())
                 time.sleep(0.01)
-                terminal.write(data[9:])
-            time.sleep(0.03)
+        time.sleep(0.02)
 
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    try:
+    with device(step) as terminal:
+        terminal.write(banner.encode())
         yield terminal.name
-    finally:
-        end.set()
-        thread.join(10)
-        terminal.unplug()
-
-
-def by_log(tmp_path, text, map_text):
-    """Return the exchanges of an import of a log with a map of this text."""
-    (tmp_path / "board.log").write_text(text)
-    (tmp_path / "m.toml").write_text(map_text)
-    return read_source(tmp_path / "board.log", importer="csv", map_file=tmp_path / "m.toml").exchanges
 
 
 @pytest.mark.parametrize("name", FORMS)
@@ -85,7 +69,7 @@ def test_printed_ranges_are_recorded(tmp_path, name):
     assert told == {(own, devices[0], 1.0), (own, devices[1], 2.0)}
     # The import of the same lines as a log, by another program (DuckDB), gives the same.
     constant = "" if "from_id" in LINES[name]["line"] else "[constants]\nfrom_id = 40\n"
-    logged = by_log(tmp_path, text * 3, f'line = "{name}"\n{constant}')
+    logged = imported(tmp_path, text * 3, f'line = "{name}"\n{constant}', "board.log").exchanges
     for column in ("initiator", "range_m"):
         assert {*getattr(logged, column).tolist()} == {*getattr(e, column).tolist()}
     assert (len(e) >= 10, found.meta["dialect"]) == (True, name)
@@ -98,10 +82,10 @@ def test_printed_ranges_are_recorded(tmp_path, name):
 
 def test_a_map_of_lines_serves_as_for_logs_and_a_stream_is_corrected(tmp_path):
     keys = 'line = "{from_id}->{to_id}: {range_m} ({rxp2})"\n[units]\ndistance = "cm"\n'
-    assert set(by_log(tmp_path, "1->2: 150 (-80.5)\n" * 5, keys).range_m.tolist()) == {1.5}
+    assert set(imported(tmp_path, "1->2: 150 (-80.5)\n" * 5, keys, "board.log").exchanges.range_m.tolist()) == {1.5}
     calibrated(tmp_path, 1, 2)
     with printing("1->2: 150 (-80.5)\n") as port:
-        words = ("--dialect", "m.toml", "-c", "c.json", "--duration", "1.0")
+        words = ("--dialect", "map.toml", "-c", "c.json", "--duration", "1.0")
         done = succeed("uwblink", "stream", port, *words, cwd=tmp_path)
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(rows) >= 5
@@ -113,9 +97,9 @@ def test_maps_have_the_same_effect_for_boards_and_logs(tmp_path):
     """Units of a position, a constant initiator, ids of words, values without a range, and the sign of powers."""
     keys = 'line = "{to_id} {range_mm} {rxp2}"\nmissing = [65535]\n[units]\npower = "-dBm"\n[constants]\nfrom_id = 9\n'
     lines = "left 1500 80.5\nright 2500 81.5\nright 65535 99.0\n"
-    logged = by_log(tmp_path, lines, f"{keys}[ids]\nleft = 40\nright = 41\n")
+    logged = imported(tmp_path, lines, f"{keys}[ids]\nleft = 40\nright = 41\n", "board.log").exchanges
     with printing(lines) as port:
-        words = ("--dialect", "m.toml", "--duration", "1.0", "-o", "r.uwb")
+        words = ("--dialect", "map.toml", "--duration", "1.0", "-o", "r.uwb")
         succeed("uwblink", "record", port, *words, cwd=tmp_path)
     recorded = uwblink.load(tmp_path / "r.uwb").exchanges
     for x in (logged, recorded):
@@ -213,18 +197,22 @@ def test_the_page_shows_printed_ranges_and_their_corrections(tmp_path):
     correct = load_correction(calibrated(tmp_path, 40, 6018))
     one, other = BOTH.splitlines(keepends=True)
     with printing(one) as port, LivePage(tmp_path / "r.uwb", correct=correct) as page:
-        how: dict[str, Any] = {"ids": [40], "duration_s": 1.0, "watch": page.watch, "listeners": [page]}
-        done = uwblink.boards.record_printed([port], tmp_path / "r.uwb", dialect_of("arduino"), **how)
+        done = uwblink.boards.record_printed(
+            [port], tmp_path / "r.uwb", dialect_of("arduino"), ids=[40], duration_s=1.0, watch=page.watch,
+            listeners=[page],
+        )  # fmt: skip
         body = page.body()
     assert f"{done.exchanges} ranges of 2 devices" in str(done)
     for text in ("40&nbsp;&rarr;&nbsp;6018", "<td>1.000</td><td>0.750</td>", 'polyline class="corrected"'):
         assert text in body
     # There is no share of successful exchanges, because failed ones are not printed.
     assert "%" not in body
-    with printing(other) as port, LivePage(tmp_path / "s.uwb", correct=correct) as page:
-        how = {"ids": [40], "duration_s": 30, "watch": page.watch, "listeners": [page]}
-        with pytest.raises(uwblink.errors.PlanError, match="6019"):
-            uwblink.boards.record_printed([port], tmp_path / "s.uwb", dialect_of("arduino"), **how)
+    said = pytest.raises(uwblink.errors.PlanError, match="6019")
+    with printing(other) as port, LivePage(tmp_path / "s.uwb", correct=correct) as page, said:
+        uwblink.boards.record_printed(
+            [port], tmp_path / "s.uwb", dialect_of("arduino"), ids=[40], duration_s=30, watch=page.watch,
+            listeners=[page],
+        )  # fmt: skip
 
 
 @pytest.mark.slow

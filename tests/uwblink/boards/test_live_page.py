@@ -14,12 +14,11 @@ import urllib.request
 import numpy as np
 import pytest
 
-import calib
 import uwblink
-from tests.boards import bench_scenario, record_bench, served
+from tests.boards import After, bench_scenario, record_bench, served
 from tests.browser import chromium
 from tests.processes import BIN, wait_until
-from uwblink.boards import LivePage, Progress, live_page, load_correction
+from uwblink.boards import LivePage, Progress, live_page
 from uwblink.boards.listeners import PairState, Turn
 from uwblink.recording.schema import Fault
 from uwblink.wire import RangeReport
@@ -33,23 +32,12 @@ def fetch(page, path="", method="GET", **headers):
         return answer.headers, answer.read().decode()
 
 
-class Looking(uwblink.Listener):
-    """Fetches the page after some number of exchanges."""
-
-    def __init__(self, at, look):
-        self.left, self.look, self.seen = at, look, []
-
-    def on_turn(self, turn):
-        self.left -= 1
-        if not self.left:
-            self.seen.append(self.look())
-
-
 def recorded(tmp_path, page, look):
-    ports = VirtualPorts(bench_scenario(), lost_share=0.1)
-    looking, plan = Looking(250, look), uwblink.RangingPlan(rate_hz=100.0)
-    how = {"duration_s": 3.0, "listeners": [page, looking], "watch": page.watch}
-    return record_bench(tmp_path / "f.uwb", plan, ports, **how), looking.seen[0]
+    """Record three seconds, and return the result and what a look at the page after 250 exchanges shows."""
+    ports, seen = VirtualPorts(bench_scenario(), lost_share=0.1), []
+    listeners = [page, After(t250=lambda: seen.append(look()))]
+    how = {"duration_s": 3.0, "listeners": listeners, "watch": page.watch}
+    return record_bench(tmp_path / "f.uwb", uwblink.RangingPlan(rate_hz=100.0), ports, **how), seen[0]
 
 
 def corrected(exchanges):
@@ -233,18 +221,6 @@ def test_a_browser_shows_the_live_page_and_updates_it(tmp_path):
         _, done = recorded(tmp_path, page, look)
     assert (done.count("<polyline") >= 3, "recording f.uwb" in done) == (True, True)
     assert len(bodies) >= 2, "the script fetches the body again"
-
-
-def test_a_calibration_s_correction_is_found_by_its_entry_point(tmp_path):
-    flight = calib.sample_flight()
-    calibration = calib.fit(flight).calibration
-    (tmp_path / "c.json").write_text("{}")
-    with pytest.raises(uwblink.errors.PlanError, match=r"c\.json"):
-        load_correction(tmp_path / "c.json")
-    calibration.save(tmp_path / "d.json")
-    correct = load_correction(tmp_path / "d.json")
-    expected = calibration.apply(calib.Ranges.from_exchanges(flight.exchanges)).corrected_m
-    assert correct(flight.exchanges)["corrected_m"].tolist() == expected.tolist()
 
 
 def test_the_command_prints_the_address_of_the_page_and_serves_it(tmp_path):

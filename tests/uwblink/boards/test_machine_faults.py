@@ -3,9 +3,7 @@
 import itertools
 import os
 import re
-import select
 import subprocess
-import threading
 import time
 import tracemalloc
 from contextlib import contextmanager
@@ -18,27 +16,15 @@ import pytest
 import uwblink
 from benchmarks.hours import AnsweringPort, AnsweringPorts
 from tests import processes
-from tests.boards import bench_scenario, record_bench, served
+from tests.boards import After, bench_scenario, device, record_bench, served
 from uwblink.boards.listeners import Progress
-from uwblink.boards.ports import SerialPorts, Terminal
-from uwblink.boards.record import LONGEST_BACKLOG_S, RecordingWriter, record
+from uwblink.boards.ports import SerialPorts
 from uwblink.boards.recorder import Recorder
 from uwblink.wire import messages as m
 from uwblink.wire.codec import encode
 from uwbsim.boards.virtual_board import VirtualPorts
 
 HOUR_NS = 3600 * 10**9
-
-
-class After(uwblink.Listener):
-    """Runs functions after some numbers of turns of the plan."""
-
-    def __init__(self, **what):
-        self.turns, self._what = 0, {int(name[1:]): do for name, do in what.items()}
-
-    def on_turn(self, turn):
-        self.turns += 1
-        self._what.get(self.turns, lambda: None)()
 
 
 def exchanges_of(path):
@@ -54,7 +40,9 @@ def test_setting_the_host_clock_changes_no_times(tmp_path, monkeypatch):
     before = plain()
     with served() as server:
         ports = list(server.names.values())
-        record(ports, path, uwblink.RangingPlan(), duration_s=60.0, listeners=[clock], stop=lambda: clock.turns > 60)
+        uwblink.record(
+            ports, path, uwblink.RangingPlan(), duration_s=60.0, listeners=[clock], stop=lambda: clock.turns > 60
+        )
     time_ns = uwblink.load(path).exchanges.time_ns
     assert len(time_ns) > 50
     # The duration of the test, and not an hour.
@@ -97,36 +85,6 @@ def test_suspension_is_only_a_gap(tmp_path):
     assert max(len(kinds), done.tried - done.exchanges) <= 1
 
 
-@pytest.fixture
-def live(tmp_path):
-    with uwblink.Recording.create(tmp_path / "live.uwb", live=True) as recording:
-        yield recording
-
-
-def test_a_stopped_recorder_does_not_report_a_slow_disk(live, monkeypatch):
-    plain, later = time.monotonic, [0.0]
-    with RecordingWriter(live) as writer:
-        writer.check()
-        monkeypatch.setattr(time, "monotonic", lambda: plain() + later[0])
-        later[0] = 3 * LONGEST_BACKLOG_S  # Ctrl-Z, and a minute later fg
-        writer.check()
-        writer.on_bytes(5, "port", "in", b"x")
-    assert len(live.frames()) == 1
-
-
-def test_a_slow_disk_is_reported(live, monkeypatch):
-    plain, later = time.monotonic, [0.0]
-    with RecordingWriter(live) as writer:
-        monkeypatch.setattr(time, "monotonic", lambda: plain() + later[0])
-        monkeypatch.setattr(writer, "_write", lambda: None)
-        with pytest.raises(uwblink.errors.RecordingError, match=r"the disk is 2\d s late"):
-            for _ in range(60):  # the loop asks during all this time
-                later[0] += 0.5
-                writer.check()
-        monkeypatch.undo()
-        writer.behind_s = 0.0
-
-
 @pytest.mark.parametrize("replaced", [False, True])
 def test_a_removed_file_is_reported_within_a_second(tmp_path, replaced):
     path = tmp_path / "f.uwb"
@@ -142,7 +100,9 @@ def test_a_removed_file_is_reported_within_a_second(tmp_path, replaced):
         served() as server,
         pytest.raises(uwblink.errors.RecordingError, match=r"f\.uwb: was removed or replaced during"),
     ):
-        record(server.names.values(), path, uwblink.RangingPlan(), duration_s=60.0, listeners=[After(t20=remove)])
+        uwblink.record(
+            server.names.values(), path, uwblink.RangingPlan(), duration_s=60.0, listeners=[After(t20=remove)]
+        )
     assert time.monotonic() < begun[0] + 20.0  # a second on an idle machine
     assert not replaced or path.read_text() == "mine"
 
@@ -224,25 +184,17 @@ CONTROLS = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f]")
 @contextmanager
 def hostile(board, link, said):
     """A device that returns its id when asked, and random bytes for every other command; yields its input."""
-    terminal, over, got, answers = Terminal(link), threading.Event(), [], itertools.cycle(said)
+    got, answers = [], itertools.cycle(said)
 
-    def serve():
-        assert terminal.fileno is not None
-        while not over.is_set():
-            if select.select([terminal.fileno], [], [], 0.05)[0]:
-                got.append(terminal.read())
-                answer = encode(m.IdReport(board)) if b"C01" in got[-1] else next(answers)
-                for at in range(0, len(answer), 1000):
-                    terminal.write(answer[at : at + 1000])
+    def step(terminal):
+        if data := terminal.read():
+            got.append(data)
+            answer = encode(m.IdReport(board)) if b"C01" in data else next(answers)
+            for at in range(0, len(answer), 1000):
+                terminal.write(answer[at : at + 1000])
 
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
+    with device(step, link):
         yield got
-    finally:
-        over.set()
-        thread.join()
-        terminal.unplug()
 
 
 def test_hostile_devices_have_no_effect(tmp_path):

@@ -10,13 +10,10 @@ import warnings
 
 import numpy as np
 import pytest
-import typer
 
 import uwblink
 from tests.processes import wait_until
-from tests.shared_data import ROOT
 from uwblink.cli import shared
-from uwblink.cli.commands import app
 
 
 class MineError(Exception):
@@ -97,22 +94,6 @@ def test_python_m_is_the_command(package):
     first, beside = found.stdout.splitlines()
     assert first == f"{package} {uwblink.__version__}"
     assert re.fullmatch(r"Python 3\.[0-9.]+, numpy [0-9.]+, .*duckdb [0-9.]+, .*", beside)
-
-
-def test_parameters_of_the_library_have_flags():
-    group = typer.main.get_command(app)
-    options = {o for command in group.commands.values() for p in command.params for o in p.opts}  # type: ignore[attr-defined]
-    options |= {"--map"}  # of `import csv`
-    named = set()
-    for path in (ROOT / "uwblink").rglob("*.py"):
-        if "cli" in path.parts:
-            continue
-        text = re.sub(r'""".*?"""', "", path.read_text(), flags=re.DOTALL)
-        assert re.findall(r'"[^"\n]*?(?<![-\w])--[a-z][-a-z]+[^"\n]*"', text) == [], path
-        named |= set(re.findall(r'"[^"\n]*`([a-z_]+)`', text))
-    assert {"force", "offset", "map_file", "tags_from"} <= named
-    # Descriptions of map keys name columns of tables and keys of maps.
-    assert {shared.with_flags(f"`{name}`") for name in named - {"message", "time_s", "line"}} <= options
 
 
 # Actions of a command before its imports.

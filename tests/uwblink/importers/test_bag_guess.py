@@ -1,10 +1,12 @@
-"""Bags of ROS 1, ROS 2 and MCAP with message types defined here: topics of ranges, which are guessed and imported
+"""Bags of ROS 1, ROS 2 and MCAP, some with message types defined here: topics of ranges, which are guessed and imported
 without other files, notes on their poses, and exchanges by a map of their fields.
 """
 
 import json
 import sqlite3
+import struct
 from contextlib import closing, suppress
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +14,12 @@ import pytest
 from tests import processes
 from tests.errors import one_line
 from tests.uwblink.importers.test_forms import PLANT, ROUNDS
+from uwblink import Contents, Exchanges, Poses, load
 from uwblink.errors import ArgumentError, ImportTableError
+from uwblink.exporters import export_recording
 from uwblink.importers import import_recording, read_source
 from uwblink.importers.guess import guess_map
-from uwblink.recording.contents import load
+from uwblink.importers.poses import read_poses
 
 pytest.importorskip("rosbags", reason="the extra uwbcal[bags] is not installed")
 from rosbags.rosbag1 import Writer as Writer1
@@ -23,12 +27,14 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-EXCHANGE = "std_msgs/Header header\nuint16 a\nuint16 b\nuint64[6] stamps\nfloat32 power\nfloat64 odd\n"
-ONE_OF_LIST = "string anchor\nfloat64 distance\nfloat32 rssi\n"
-LISTS = "std_msgs/Header header\nuwb_msgs/Range[] ranges\n"
-MINES = "std_msgs/Header header\nstring dest\nfloat32 range_mm\nfloat32 rssi\n"
-STAMPS = "std_msgs/Header header\nuint16 src\nuint16 dst\nuint64 tx1\nuint64 rx1\nuint64 tx2\nuint64 rx2\n"
-TYPES = {"Exchange": EXCHANGE, "Range": ONE_OF_LIST, "Ranges": LISTS, "Mine": MINES, "Stamped": STAMPS}
+HEADER = "std_msgs/Header header\n"
+TYPES = {
+    "Exchange": HEADER + "uint16 a\nuint16 b\nuint64[6] stamps\nfloat32 power\nfloat64 odd\n",
+    "Range": "string anchor\nfloat64 distance\nfloat32 rssi\n",
+    "Ranges": HEADER + "uwb_msgs/Range[] ranges\n",
+    "Mine": HEADER + "string dest\nfloat32 range_mm\nfloat32 rssi\n",
+    "Stamped": HEADER + "uint16 src\nuint16 dst\nuint64 tx1\nuint64 rx1\nuint64 tx2\nuint64 rx2\n",
+}
 TICK_M = 299_702_547.0 / (128 * 499_200_000)
 WHEN = 1_706_822_508_042_560_815
 
@@ -58,23 +64,17 @@ def header(store, time_ns, *first):
     return types["std_msgs/msg/Header"](*first, stamp, "map")
 
 
-def ros2(path, topics, plugin=StoragePlugin.MCAP):
-    store = store_of(Stores.ROS2_JAZZY)
-    with Writer2(path, version=9, storage_plugin=plugin) as bag:
+def bag_of(path, topics, plugin=StoragePlugin.MCAP):
+    """Write a bag of ROS 1 if the path ends with .bag, else one of ROS 2; return the path."""
+    old = path.suffix == ".bag"
+    store = store_of(Stores.ROS1_NOETIC if old else Stores.ROS2_JAZZY)
+    writer: Any = Writer1(path) if old else Writer2(path, version=9, storage_plugin=plugin)
+    serialize: Any = store.serialize_ros1 if old else store.serialize_cdr
+    with writer as bag:
         for topic, (kind, make) in topics.items():
             connection = bag.add_connection(topic, kind, typestore=store)
-            for time_ns, message in make(store, ()):
-                bag.write(connection, time_ns, store.serialize_cdr(message, kind))
-    return path
-
-
-def ros1(path, topics):
-    store = store_of(Stores.ROS1_NOETIC)
-    with Writer1(path) as bag:
-        for topic, (kind, make) in topics.items():
-            connection = bag.add_connection(topic, kind, typestore=store)
-            for time_ns, message in make(store, (0,)):
-                bag.write(connection, time_ns, store.serialize_ros1(message, kind))
+            for time_ns, message in make(store, (0,) if old else ()):
+                bag.write(connection, time_ns, serialize(message, kind))
     return path
 
 
@@ -85,15 +85,7 @@ def exchanges(store, first):
         yield time_ns + 5, kind(head, a, b, np.array(stamps, dtype=np.uint64), -80.5, float("nan"))
 
 
-def pairs_of_ranges(store, first):
-    for time_ns, (a, b), _, truth in truths():
-        one = store.types["uwb_msgs/msg/Range"]
-        listed = [one(f"anchor{a}", truth * 100, -79.5), one(f"anchor{b}", truth * 200, -78.5)]
-        yield time_ns, store.types["uwb_msgs/msg/Ranges"](header(store, time_ns, *first), listed)
-
-
 EXCHANGES = {"/uwb": ("uwb_msgs/msg/Exchange", exchanges)}
-RANGED = {"/tag/ranges": ("uwb_msgs/msg/Ranges", pairs_of_ranges), **EXCHANGES}
 NAMED = "\n".join(f'{name} = "stamps.{k}"' for k, name in enumerate(("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")))
 
 
@@ -198,17 +190,17 @@ POSES = {"/vrpn_mocap/drone/pose": (POSE, posed)}
 RANGES = by_anchor("/uwb/tag7/range_{}", RANGE, as_range)
 NUMBERS = by_anchor("/tag7/uwb_anchor{}", NUMBER, as_number)
 FORMS = {
-    "Range by anchor": (ros2, RANGES | HEIGHT | POSES, "/uwb/tag7/range_{to_id}", ()),
-    "Range in ROS 1": (ros1, RANGES, "/uwb/tag7/range_{to_id}", ()),
-    "Range without a tag": (ros2, by_anchor("/range/{}", RANGE, as_range), "/range/{to_id}", ("from_id",)),
-    "numbers": (ros2, NUMBERS, "/tag7/uwb_anchor{to_id}", ()),
-    "an array": (ros2, {"/uwb/ranges": ("std_msgs/msg/Float32MultiArray", rounds)}, "/uwb/ranges", ("from_id",)),
-    "lists": (ros2, {"/tag7/uwb": ("uwb_msgs/msg/Ranges", lists)} | POSES, "/tag7/uwb", ()),
-    "fields in mm": (ros1, {"/tag7/uwb": (MINE, of_anchor(None, as_mine))}, "/tag7/uwb", ()),
-    "fields, and Range": (ros2, {"/tag7/uwb": (MINE, of_anchor(None, as_mine))} | RANGES, "/tag7/uwb", ()),
-    "fields without a tag, and Range": (ros2, {"/u": (MINE, of_anchor(None, as_mine))} | RANGES, "/u", ("from_id",)),
-    "JSON": (ros2, {"/tag7/uwb": (TEXT, of_anchor(None, as_text))} | HEIGHT, "/tag7/uwb", ()),
-    "stamps, and Range": (ros2, {"/uwb": (STAMPED, of_anchor(None, as_stamped))} | RANGES, "/uwb", ()),
+    "Range by anchor": ("b", RANGES | HEIGHT | POSES, "/uwb/tag7/range_{to_id}", ()),
+    "Range in ROS 1": ("b.bag", RANGES, "/uwb/tag7/range_{to_id}", ()),
+    "Range without a tag": ("b", by_anchor("/range/{}", RANGE, as_range), "/range/{to_id}", ("from_id",)),
+    "numbers": ("b", NUMBERS, "/tag7/uwb_anchor{to_id}", ()),
+    "an array": ("b", {"/uwb/ranges": ("std_msgs/msg/Float32MultiArray", rounds)}, "/uwb/ranges", ("from_id",)),
+    "lists": ("b", {"/tag7/uwb": ("uwb_msgs/msg/Ranges", lists)} | POSES, "/tag7/uwb", ()),
+    "fields in mm": ("b.bag", {"/tag7/uwb": (MINE, of_anchor(None, as_mine))}, "/tag7/uwb", ()),
+    "fields, and Range": ("b", {"/tag7/uwb": (MINE, of_anchor(None, as_mine))} | RANGES, "/tag7/uwb", ()),
+    "fields without a tag, and Range": ("b", {"/u": (MINE, of_anchor(None, as_mine))} | RANGES, "/u", ("from_id",)),
+    "JSON": ("b", {"/tag7/uwb": (TEXT, of_anchor(None, as_text))} | HEIGHT, "/tag7/uwb", ()),
+    "stamps, and Range": ("b", {"/uwb": (STAMPED, of_anchor(None, as_stamped))} | RANGES, "/uwb", ()),
 }
 
 
@@ -218,8 +210,8 @@ RARER = ("Range in ROS 1", "Range without a tag", "numbers", "fields, and Range"
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in RARER)) for name in FORMS])
 def test_ranges_of_a_bag_come_in_by_its_guess(tmp_path, name):
-    write, topics, template, asked = FORMS[name]
-    found = by_guess(tmp_path, write(tmp_path / ("b.bag" if write is ros1 else "b"), topics), asked)
+    file, topics, template, asked = FORMS[name]
+    found = by_guess(tmp_path, bag_of(tmp_path / file, topics), asked)
     text = (tmp_path / "map.toml").read_text()
     assert f"[topics.{json.dumps(template)}]\n" in text
     assert "header.stamp" not in text, "the time of a message is used"
@@ -241,7 +233,7 @@ def test_both_ids_in_names_of_topics_may_be_words(tmp_path):
         ("/to_{to_id}/{from_id}", "/to_{1}/{0}"),
     ):
         topics = {name.format(*pair): (RANGE, of_anchor(k, as_range)) for k, pair in enumerate(pairs)}
-        bag = ros2(tmp_path / template.replace("/", "_"), topics | HEIGHT)
+        bag = bag_of(tmp_path / template.replace("/", "_"), topics | HEIGHT)
         assert f"[topics.{json.dumps(template)}]\n" in guess_map(bag).text
         got = ends(by_guess(tmp_path, bag))
         assert ({(one, str(other)[-1]) for one, other in got}, len(got)) == (set(pairs), len(PLANT))
@@ -250,8 +242,8 @@ def test_both_ids_in_names_of_topics_may_be_words(tmp_path):
 def test_ids_in_names_of_topics_complete_those_in_messages(tmp_path):
     """Or the id in the names; an id of a robot differs from an id of the anchors in its messages."""
     topics = {f"/robot{k}/uwb": (MINE, of_anchor(k, as_mine)) for k in range(4)}
-    assert set(ends(by_guess(tmp_path, ros2(tmp_path / "fields", topics)))) == {(f"robot{k}", k) for k in range(4)}
-    bag = ros2(tmp_path / "range", by_anchor("/tag1{}/range", RANGE, as_range))
+    assert set(ends(by_guess(tmp_path, bag_of(tmp_path / "fields", topics)))) == {(f"robot{k}", k) for k in range(4)}
+    bag = bag_of(tmp_path / "range", by_anchor("/tag1{}/range", RANGE, as_range))
     assert set(ends(by_guess(tmp_path, bag, ("to_id",)))) == {(10, 7), (11, 7), (12, 7), (13, 7)}
 
 
@@ -260,7 +252,7 @@ def test_topics_that_other_types_resemble_are_listed_with_their_ids(tmp_path):
         f"/uwb/{a}/{b}": (RANGE, of_anchor(k, as_range))
         for k, (a, b) in enumerate([("a", "c"), ("a", "d"), ("b", "c"), ("b", "d")])
     }
-    bag = ros2(tmp_path / "b", topics | {"/uwb/a/status": (TEXT, lambda *_: ())})
+    bag = bag_of(tmp_path / "b", topics | {"/uwb/a/status": (TEXT, lambda *_: ())})
     assert '[topics."/uwb/b/c"]\nfrom_id = "b"\nto_id = "c"\n' in guess_map(bag).text
     found = by_guess(tmp_path, bag)
     assert found.meta["tag_names"] == {"1": "a", "2": "b", "3": "c", "4": "d"}
@@ -272,7 +264,7 @@ NO_TOPIC = r"no topic '/uwb/.*there are /uwb/tag7/b/range_9 \(sensor_msgs"
 
 def test_a_template_of_topics_in_a_map(tmp_path):
     """A placeholder is a part of a name, and the constant of a topic has priority over that of a template."""
-    bag = ros2(tmp_path / "b", RANGES | {"/uwb/tag7/b/range_9": (RANGE, of_anchor(0, as_range))})
+    bag = bag_of(tmp_path / "b", RANGES | {"/uwb/tag7/b/range_9": (RANGE, of_anchor(0, as_range))})
     text = '[topics."/uwb/tag{from_id}/range_{to_id}"]\nfpp2 = -80\n[topics."/uwb/tag7/range_2"]\nfpp2 = -90\n'
     e = by_map(tmp_path, bag, text + '[columns]\nrange_m = "range"\n').exchanges
     assert len(e) == len(PLANT)
@@ -288,7 +280,7 @@ def test_a_template_of_topics_in_a_map(tmp_path):
 
 
 def test_topics_named_as_ours_need_no_map(tmp_path):
-    bag = ros2(tmp_path / "b", by_anchor("/uwb/range_7_{}", RANGE, as_range) | HEIGHT | POSES)
+    bag = bag_of(tmp_path / "b", by_anchor("/uwb/range_7_{}", RANGE, as_range) | HEIGHT | POSES)
     assert sorted(ends(read_source(bag, importer="bag"))) == sorted((7, r.anchor) for r in PLANT)
 
 
@@ -297,7 +289,7 @@ GUESS = ("uwblink", "import", "guess")
 
 def test_the_commands_end_with_true_distances(tmp_path):
     """Each command is the one that the previous command printed."""
-    ros2(tmp_path / "b", RANGES | HEIGHT | POSES)
+    bag_of(tmp_path / "b", RANGES | HEIGHT | POSES)
     anchors = "".join(f"[[anchors]]\nid = {a}\nposition_m = [{a}, 2, 0]\n" for a in range(4))
     (tmp_path / "TAGS.toml").write_text(f'[[tags]]\nid = 7\nbody = "drone"\nlever_arm_m = [0, 0, 0]\n{anchors}')
     said = processes.succeed(*GUESS, "b", "-o", "map.toml", cwd=tmp_path).stdout.splitlines()
@@ -312,7 +304,7 @@ def test_the_commands_end_with_true_distances(tmp_path):
 
 
 def test_without_poses_the_command_prints_possible_commands(tmp_path):
-    ros2(tmp_path / "b", RANGES)
+    bag_of(tmp_path / "b", RANGES)
     said = processes.succeed(*GUESS, "b", "-o", "map.toml", cwd=tmp_path).stdout
     assert all(words in said for words in ("calib survey", "fit_from_ranges", "constants of pairs need true"))
     assert said.splitlines()[1] in (tmp_path / "map.toml").read_text()
@@ -321,7 +313,7 @@ def test_without_poses_the_command_prints_possible_commands(tmp_path):
 
 
 def test_bags_without_ranges_are_refused_with_their_topics(tmp_path):
-    ros2(tmp_path / "b", POSES | HEIGHT)
+    bag_of(tmp_path / "b", POSES | HEIGHT)
     naming = ["/vrpn_mocap/drone/pose", "geometry_msgs/msg/PoseStamped", "/height/drone"]
     processes.refuse(*GUESS, "b", "-o", "map.toml", naming=naming, cwd=tmp_path)
     assert not (tmp_path / "map.toml").exists()
@@ -332,7 +324,7 @@ def test_bags_without_ranges_are_refused_with_their_topics(tmp_path):
 def test_types_that_a_bag_does_not_define_leave_the_others(tmp_path):
     for name, topics in {"both": NUMBERS, "one": {}}.items():
         more = {"/px4/status": (MINE, of_anchor(None, as_mine))}
-        bag = ros2(tmp_path / name, topics | more, StoragePlugin.SQLITE3)
+        bag = bag_of(tmp_path / name, topics | more, StoragePlugin.SQLITE3)
         with closing(sqlite3.connect(bag / f"{name}.db3")) as db, db:
             db.execute("DELETE FROM message_definitions")
     assert len(by_guess(tmp_path, tmp_path / "both").exchanges) == len(PLANT)
@@ -348,7 +340,7 @@ def test_messages_without_ranges_are_one_line(tmp_path, text):
     def texts(store, _):
         return ((START + k * 10**8, store.types[TEXT](text)) for k in range(12))
 
-    bag = ros2(tmp_path / "b", {"/a/{b": (TEXT, texts)})
+    bag = bag_of(tmp_path / "b", {"/a/{b": (TEXT, texts)})
     with pytest.raises(ImportTableError, match=one_line("no topic with ranges")):
         guess_map(bag)
     with suppress(ImportTableError):
@@ -356,7 +348,7 @@ def test_messages_without_ranges_are_one_line(tmp_path, text):
 
 
 def test_without_the_extra_the_error_names_the_package_to_install(tmp_path, monkeypatch):
-    bag = ros2(tmp_path / "b", RANGES)
+    bag = bag_of(tmp_path / "b", RANGES)
     monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
     with pytest.raises(ImportTableError, match=r"pip install 'uwbcal\[bags\]'"):
         guess_map(bag)
@@ -365,9 +357,9 @@ def test_without_the_extra_the_error_names_the_package_to_install(tmp_path, monk
 # Exchanges by a map of the fields of messages.
 
 
-@pytest.mark.parametrize("write", [ros1, ros2])
-def test_exchanges_by_the_fields_of_a_message(tmp_path, write):
-    bag = write(tmp_path / ("b.bag" if write is ros1 else "b"), EXCHANGES)
+@pytest.mark.parametrize("name", ["b.bag", "b"])
+def test_exchanges_by_the_fields_of_a_message(tmp_path, name):
+    bag = bag_of(tmp_path / name, EXCHANGES)
     found = by_map(tmp_path, bag, f'[columns]\nfrom_id = "a"\nto_id = "b"\nfpp1 = "power"\nfpp2 = "odd"\n{NAMED}\n')
     e, expected = found.exchanges, list(truths())
     count = import_recording(bag, tmp_path / "o.uwb", importer="bag", map_file=tmp_path / "map.toml")
@@ -380,21 +372,11 @@ def test_exchanges_by_the_fields_of_a_message(tmp_path, write):
     assert (found.meta["source"], found.meta["imported_from"]) == ("import bag", bag.name)
 
 
-def test_a_list_of_ranges_in_each_message_of_one_topic_of_several(tmp_path):
-    text = 'each = "ranges"\n[topics."/tag/ranges"]\nfrom_id = "drone"\n[units]\ndistance = "cm"\n'
-    text += '[columns]\nto_id = "ranges.anchor"\nrange_m = "ranges.distance"\nrxp2 = "ranges.rssi"\n'
-    found = by_map(tmp_path, ros2(tmp_path / "b", RANGED), text)
-    expected = [factor * row[3] for row in truths() for factor in (1, 2)]
-    np.testing.assert_allclose(found.exchanges.range_m, expected, rtol=1e-12)
-    assert set(found.meta["tag_names"].values()) == {"drone", "anchor4", "anchor7", "anchor9"}
-    assert found.powers["rxp2_dbm"][:2].tolist() == [-79.5, -78.5]
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", r"`map_file` must name the topics.*there are /tag/ranges \(uwb_msgs/msg/Ranges\), /uwb"),
-        ('[topics."/none"]\n', "no topic '/none'; there are /tag/ranges"),
+        ("", r"`map_file` must name the topics.*there are /tag7/uwb \(uwb_msgs/msg/Ranges\), /uwb"),
+        ('[topics."/none"]\n', "no topic '/none'; there are /tag7/uwb"),
         ('each = "ranges"\n[topics."/uwb"]\n', "a message of /uwb has no list 'ranges'"),
         ('[topics."/uwb"]\n', "column 'from_id' is missing; there are header.stamp, header.frame_id, a, b, stamps"),
         ('[topics."/uwb"]\nfrom_id = [1]\n', r"topics\./uwb\.from_id"),
@@ -403,7 +385,7 @@ def test_a_list_of_ranges_in_each_message_of_one_topic_of_several(tmp_path):
 )
 def test_missing_topics_and_fields_are_named(tmp_path, text, said):
     with pytest.raises(ImportTableError, match=said):
-        by_map(tmp_path, ros2(tmp_path / "b", RANGED), text)
+        by_map(tmp_path, bag_of(tmp_path / "b", FORMS["lists"][1] | EXCHANGES), text)
 
 
 def test_other_files_than_bags_are_refused(tmp_path):
@@ -418,3 +400,122 @@ def test_other_files_than_bags_are_refused(tmp_path):
             read_source(tmp_path / name, **more)
     with pytest.raises(ArgumentError, match="needs one file, found 2"):
         read_source([tmp_path / "no.bag"] * 2, importer="bag")
+
+
+# MCAP files of JSON messages: exports of the project, which are imported again, and files of the library `mcap`.
+
+
+@pytest.fixture
+def exported(tmp_path):
+    """A recording of two pairs and two bodies with some unknown values, and the folder of its export."""
+    rng = np.random.default_rng(3)
+    n = 40
+    tx1, reply, flight = (rng.integers(low, high, n) for low, high in ((0, 10**9), (10**7, 2 * 10**7), (100, 3000)))
+    exchanges = Exchanges.from_arrays(
+        np.where(np.arange(n) % 2, 1, 3), np.full(n, 2), time_ns=WHEN + np.arange(n) * 10**7,
+        tx1=tx1, rx1=tx1 + flight, tx2=tx1 + flight + reply, rx2=tx1 + 2 * flight + reply,
+        fpp1_dbm=rng.normal(-85, 3, n), fpp2_dbm=np.where(np.arange(n) < 30, np.nan, -84.5),
+        skew1_ppm=rng.normal(size=n), truth_m=rng.normal(4, 1, n),
+    )  # fmt: skip
+    attitude = rng.normal(size=(20, 4))
+    poses = Poses(
+        WHEN + np.arange(20) * 10**8, np.array(["drone", "car"] * 10), rng.normal(size=(20, 3)),
+        attitude / np.linalg.norm(attitude, axis=1)[:, None],
+    )  # fmt: skip
+    held = Contents(exchanges=exchanges, poses=poses)
+    held.save(tmp_path / "r.uwb")
+    for to in ("mcap", "rosbag2"):
+        export_recording(tmp_path / "r.uwb", tmp_path / to, to=to)
+    return held, tmp_path / "mcap" / "recording.mcap"
+
+
+@pytest.mark.parametrize("name", ["mcap/recording.mcap", "rosbag2/rosbag2"])
+def test_exports_are_imported_without_a_map_and_by_the_guess(exported, tmp_path, name):
+    """They have distances and powers; the map that is guessed has no distances."""
+    held, found = exported[0].exchanges, read_source(tmp_path / name, importer="bag").exchanges
+    names = "time_ns initiator target range_m truth_m fpp1_dbm fpp2_dbm skew1_ppm skew2_ppm"
+    for column in names.split():
+        np.testing.assert_array_equal(getattr(found, column), getattr(held, column), err_msg=column)
+    assert not found.tx1.any()
+    e = by_guess(tmp_path, tmp_path / name).exchanges
+    np.testing.assert_array_equal([e.time_ns, e.fpp1_dbm], [held.time_ns, held.fpp1_dbm])
+    poses = read_poses(tmp_path / name)
+    for column in ("time_ns", "body", "position_m"):
+        assert getattr(poses, column).tolist() == getattr(exported[0].poses, column).tolist()
+    np.testing.assert_allclose(poses.quaternion, exported[0].poses.quaternion, atol=1e-15)
+    assert set(read_poses(tmp_path / name, topics={"lorry": "/poses/car"}).body) == {"lorry"}
+
+
+def written(path, messages, schema="uwb_msgs.Range", compressed=False):
+    """Write messages by topic with the library of the format, in chunks."""
+    mcap = pytest.importorskip("mcap.writer", reason="mcap is not installed")
+    kind = mcap.CompressionType.ZSTD if compressed else mcap.CompressionType.NONE
+    with path.open("wb") as file:
+        writer = mcap.Writer(file, compression=kind, chunk_size=500)
+        writer.start()
+        number = writer.register_schema(schema, "jsonschema", b'{"type": "object"}')
+        for topic, contents in messages.items():
+            channel = writer.register_channel(topic, "json", number)
+            for k, content in enumerate(contents):
+                data = content if isinstance(content, bytes) else json.dumps(content).encode()
+                writer.add_message(channel, WHEN + k * 10**7, data, WHEN + k * 10**7)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_others_messages_in_chunks_by_a_map(tmp_path, compressed):
+    rows = [
+        {"header": {"stamp": {"sec": 100 + k, "nsec": 5}}, "tag": 7, "to": {"anchor": 1 + k % 3}, "mm": 1000 + k}
+        for k in range(50)
+    ]
+    path = written(tmp_path / "t.mcap", {"/uwb": rows, "/other": [{"a": 1}]}, compressed=compressed)
+    (tmp_path / "m.toml").write_text(
+        '[topics."/uwb"]\n[columns]\nfrom_id = "tag"\nto_id = "to.anchor"\nrange_m = "mm"\n[units]\ndistance = "mm"\n'
+    )
+    found = read_source(path, map_file=tmp_path / "m.toml").exchanges
+    assert found.time_ns.tolist() == [(100 + k) * 10**9 + 5 for k in range(50)]
+    assert found.target.tolist() == [1 + k % 3 for k in range(50)]
+    np.testing.assert_allclose(found.range_m, 1 + np.arange(50) / 1000, atol=1e-12)
+
+
+def in_frame(x=1.0, sec=1):
+    pose = {"position": {"x": x, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+    return {"timestamp": {"sec": sec, "nsec": 0}, "pose": pose}
+
+
+@pytest.mark.parametrize(
+    ("message", "said"),
+    [
+        (b"{", "is not JSON"),
+        (b"[" * 100_000, "is not JSON"),
+        ([1], "is not an object of JSON"),
+        ({"timestamp": 3, "pose": {}}, "is no foxglove.PoseInFrame"),
+        (in_frame(x="here"), "is no foxglove.PoseInFrame"),
+        (in_frame(x=float("nan")), "is no foxglove.PoseInFrame"),
+        (in_frame(sec=10**30), "is no foxglove.PoseInFrame"),
+    ],
+)
+def test_wrong_poses_are_one_line(tmp_path, message, said):
+    path = written(tmp_path / "t.mcap", {"/poses/a": [message]}, "foxglove.PoseInFrame")
+    with pytest.raises(ImportTableError, match=said):
+        read_poses(path)
+
+
+# Versions of rosbags before 0.11.9 do not close a file that they refuse.
+@pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO.*z.mcap:pytest.PytestUnraisableExceptionWarning")
+def test_cut_broken_and_endless_files_are_one_line(exported, tmp_path):
+    data, path = exported[1].read_bytes(), tmp_path / "t.mcap"
+    # A chunk that is larger than the memory when it is unpacked.
+    content = struct.pack("<QQQII", 0, 0, 2**40, 0, 4) + b"zstd" + struct.pack("<Q", 0)
+    bomb = b"\x89MCAP0\r\n" + struct.pack("<BQ", 0x01, 8) + bytes(8) + struct.pack("<BQ", 0x06, len(content)) + content
+    longest = data[: data.index(b"uwbcal") + 6] + struct.pack("<BQ", 0x05, 2**63)
+    cuts = [(data[:cut], "") for cut in range(9, len(data) - 40, 1013)]
+    for broken, said in (*cuts, (longest, ""), (bomb, "a chunk unpacks to 1099511627776 bytes")):
+        path.write_bytes(broken)
+        with pytest.raises(ImportTableError, match=one_line("t.mcap", said)):
+            read_source(path)
+    path.unlink()
+    # An object that is nested too deeply.
+    with pytest.raises(ImportTableError, match=one_line("t.mcap")):
+        read_source(written(path, {"/uwb": [b'{"a":' * 700 + b"1" + b"}" * 700]}))

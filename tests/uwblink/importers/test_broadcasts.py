@@ -12,7 +12,7 @@ import calib
 from tests import processes
 from tests.errors import one_line
 from tests.shared_data import shared
-from tests.uwblink.test_receptions import PLACES, broadcasts
+from tests.uwblink.test_from_arrays import PLACES, broadcasts
 from uwblink import errors, load, raw_range
 from uwblink.importers import import_file, read_source
 from uwblink.importers.guess import guess_map

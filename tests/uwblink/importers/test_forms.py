@@ -3,7 +3,6 @@
 docs/importing.md lists the forms; each row of `FORMS` is a row there.
 """
 
-import csv
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ import pytest
 
 from tests.errors import one_line
 from tests.processes import ROOT
-from tests.uwblink.importers.test_table_forms import as_messages, flights, wrapped
+from tests.uwblink.importers.test_table_forms import as_messages, flights, imported, wrapped, write
 from uwblink.errors import ImportTableError
 from uwblink.importers import read_source
 from uwblink.importers.guess import guess_map
@@ -49,14 +48,6 @@ def planted(count=40, seed=3):
 
 PLANT = planted()
 ROUNDS = [PLANT[k : k + 4] for k in range(0, len(PLANT), 4)]
-
-
-def table(path, rows, delimiter=",", header=True, text=str):
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file, delimiter=delimiter)
-        writer.writerows([list(rows[0])] if header else [])
-        writer.writerows([[text(value) for value in row.values()] for row in rows])
-    return path
 
 
 def long_rows():
@@ -136,12 +127,12 @@ def named_files(folder, unit, scale):
     """Write a file per anchor, with its distance in the name; without id and distance inside."""
     for a in range(4):
         rows = [{"t_s": r.time_s, "range_m": r.range_m} for r in PLANT if r.anchor == a]
-        table(folder / f"tag7_anchor{a}_{(2 + a) * scale:g}{unit}.csv", rows)
+        write(folder / f"tag7_anchor{a}_{(2 + a) * scale:g}{unit}.csv", rows)
     return folder
 
 
 def parquet(folder):
-    source = table(folder / "wide.csv", wide_rows("d{}"))
+    source = write(folder / "wide.csv", wide_rows("d{}"))
     with duckdb.connect() as db:
         db.read_csv(str(source)).write_parquet(str(folder / "wide.parquet"))
     source.unlink()
@@ -150,7 +141,7 @@ def parquet(folder):
 
 def with_columns(columns):
     """Return a function that writes the long table with more columns, by functions of each range."""
-    return lambda folder: table(folder / "t.csv", [row | columns(r) for row, r in zip(long_rows(), PLANT, strict=True)])
+    return lambda folder: write(folder / "t.csv", [row | columns(r) for row, r in zip(long_rows(), PLANT, strict=True)])
 
 
 def registers(r):
@@ -202,7 +193,7 @@ class Form:
 
 def of(make, *words, **more):
     """Return a function that writes rows to a table in a folder."""
-    return lambda folder: table(folder / "t.csv", make(*words, **more))
+    return lambda folder: write(folder / "t.csv", make(*words, **more))
 
 
 TAG = {"from_id": 7}
@@ -232,7 +223,7 @@ FORMS = {
         powers="rxp",
     ),
     "no header": Form(
-        lambda folder: table(folder / "t.csv", long_rows(), header=False),
+        lambda folder: write(folder / "t.csv", long_rows(), header=False),
         {"time_s": 1, "from_id": 2, "to_id": 3, "range_m": 4},
     ),
     "ids and distance in names of files": Form(lambda folder: named_files(folder, "cm", 100), truth=True),
@@ -271,7 +262,7 @@ FORMS = {
         truth=True,
     ),
     "decimal commas": Form(
-        lambda folder: table(folder / "t.csv", long_rows(), ";", text=lambda v: str(v).replace(".", ",")), truth=True
+        lambda folder: write(folder / "t.csv", long_rows(), ";", text=lambda v: str(v).replace(".", ",")), truth=True
     ),
     "summary rows at the end": Form(
         of(lambda: [*long_rows(), {"t_s": "Mean", "tag": "", "anchor": "", "range_m": 3.65, "gt_m": ""}]),
@@ -348,12 +339,6 @@ def test_forms_are_imported_by_their_guess(tmp_path, name):
 LONG = "time_s,from_id,to_id,range_m,gt_range_m\n"
 
 
-def imported(tmp_path, text, map_text="", name="t.csv"):
-    (tmp_path / name).write_text(text)
-    (tmp_path / "map.toml").write_text(map_text)
-    return read_source(tmp_path / name, importer="csv", map_file=tmp_path / "map.toml" if map_text else None)
-
-
 @pytest.mark.parametrize("column", ["gt_range_m", pytest.param("fpp1", marks=pytest.mark.slow), "from_x_m"])
 def test_words_in_a_column_that_is_not_needed_are_named(tmp_path, column):
     """A column with words in half of its cells or more is refused; fewer are counted; empty ones are missing."""
@@ -399,6 +384,22 @@ def test_frequent_placeholders_of_ranges_are_refused_until_the_map_states_them(t
         ('missing = "x"', "a list of numbers and words"),
         ('[units]\nskew = "offset"', "allowed: ppm, -ppm"),
         ('[units]\nrange_m = "miles"', "units.range_m"),
+        ("bits = 33", "bits: found 33"),
+        ("bits = 32.0", "bits: found 32.0"),
+        ("bits = true", "bits: found True"),
+        ('protocol = ["ds"]', "protocol: found ['ds']"),
+        ("layout = {a = 1}", "layout: found {'a': 1}"),
+        ('layout = "tall"', "layout: found 'tall'"),
+        ("[units]\nstamps = -1.0", "units.stamps"),
+        ('[units]\ndistance = "furlong"', "units.distance"),
+        ("within_s = 0", "within_s: found 0"),
+        ('[ids]\n"a" = 70000', "ids.a: found 70000"),
+        ("[antenna_delays]\ntx = 1e9", "antenna_delays.tx"),
+        ("[antenna_delays.tags.x]\ntx = 1", "antenna_delays.tags.x"),
+        ('[columns]\ntx1 = "nothing"', "column 'nothing' is missing"),
+        ('delimiter = "--"', "delimiter: found '--'"),
+        ('[columns]\nevil = "tx1"', "columns.evil: unknown key"),
+        ('each = "x"', "the key each is for JSON lines, bags and logs"),
         ('[units]\ngt_range_m = "ns"', "units.gt_range_m"),
     ],
 )
@@ -459,7 +460,7 @@ def test_messages_as_words_with_ids_in_names_of_files(tmp_path, third):
         own = [
             {"message": words[row["message"] - 1], **{n: row[n] for n in ("time_s", "tx", "rx", "fpp")}} for row in own
         ]
-        table(tmp_path / "in" / f"tag{pair[0]}_to{pair[1]}.csv", own)
+        write(tmp_path / "in" / f"tag{pair[0]}_to{pair[1]}.csv", own)
     e = guessed(tmp_path, tmp_path / "in", {}).exchanges
     expected = sorted((row["time_s"], row["from_id"], row["to_id"], row["truth"]) for row in rows)
     assert list(zip(e.initiator.tolist(), e.target.tolist(), strict=True)) == [row[1:3] for row in expected]
@@ -468,18 +469,18 @@ def test_messages_as_words_with_ids_in_names_of_files(tmp_path, third):
 
 def test_a_time_of_flight_without_a_unit_is_asked_for(tmp_path):
     rows = [{"t_s": r.time_s, "tag": 7, "anchor": r.anchor, "ToF": r.range_m / AIR_M_PER_NS} for r in PLANT]
-    found = guessed(tmp_path, table(tmp_path / "t.csv", rows), {"range_m": "ns"})
+    found = guessed(tmp_path, write(tmp_path / "t.csv", rows), {"range_m": "ns"})
     assert found.exchanges.range_m == pytest.approx([r.range_m for r in PLANT])
 
 
 def test_the_quality_of_secure_training_sequences_is_kept(tmp_path):
     """By exchange and by message; fits do not use it."""
     rows = [row | {"sts_qual": 60 + k % 5} for k, row in enumerate(long_rows())]
-    found = guessed(tmp_path, table(tmp_path / "t.csv", rows), {})
+    found = guessed(tmp_path, write(tmp_path / "t.csv", rows), {})
     assert found.quality["sts2"].tolist() == [row["sts_qual"] for row in rows]
     assert np.isnan(found.quality["sts1"]).all()
     found.save(tmp_path / "r.uwb")
     assert load(tmp_path / "r.uwb").quality["sts2"].tolist() == found.quality["sts2"].tolist()
     messages = [row | {"sts_quality": 50 + row["message"]} for row in as_messages(wrapped(flights(40)))]
-    found = guessed(tmp_path, table(tmp_path / "messages.csv", messages), {})
+    found = guessed(tmp_path, write(tmp_path / "messages.csv", messages), {})
     assert {*zip(found.quality["sts1"].tolist(), found.quality["sts2"].tolist(), strict=True)} == {(51.0, 52.0)}

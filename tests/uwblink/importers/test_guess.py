@@ -7,6 +7,7 @@ import pytest
 
 from tests import processes
 from tests.shared_data import shared
+from tests.uwblink.importers.test_forms import guessed
 from tests.uwblink.importers.test_table_forms import (
     HEADER,
     as_messages,
@@ -25,14 +26,6 @@ from uwblink.importers.guess import guess_map
 from uwblink.ticks import TICKS_PER_SECOND
 
 POLL = ("poll_tx", "poll_rx", "resp_tx", "resp_rx", "final_tx", "final_rx")
-
-
-def guessed(tmp_path, rows, *how):
-    """Return the result of an import of a table with the map that is proposed for it."""
-    path = write(tmp_path / "t.csv", rows, *how)
-    guess = guess_map(path)
-    assert guess.complete
-    return read_table(path, mapped(tmp_path, guess.text))
 
 
 ENDS = ("timestamp", "Tag ID", "anchor_id")
@@ -64,7 +57,8 @@ def test_guesses_read_tables_with_common_column_names_correctly(tmp_path, called
     scale = dict.fromkeys(HEADER[3:9], unit) | {"truth": 100.0 if "cm" in called[-1] else 1.0}
     whole = [short | {"truth": row["truth"]} for short, row in zip(wrapped(rows), rows, strict=True)]
     table = [{name: row[n] * scale.get(n, 1) for n, name in names.items()} for row in whole]
-    found = guessed(tmp_path, table, ";", lambda value: str(value).replace(".", decimal))
+    path = write(tmp_path / "t.csv", table, ";", lambda value: str(value).replace(".", decimal))
+    found = guessed(tmp_path, path, {})
     same(found, rows)
     e = found.exchanges
     assert [e.fpp1_dbm.tolist(), e.fpp2_dbm.tolist()] == [[row[name] for row in rows] for name in ("fpp1", "fpp2")]
@@ -117,7 +111,7 @@ def test_tables_with_a_row_per_stamp_are_read(tmp_path, event, words, clock):
         lines += [
             head | {clock: row[n], event: word, "seq": row["seq"]} for n, word in zip(("tx", "rx"), words, strict=True)
         ]
-    e = guessed(tmp_path, lines).exchanges
+    e = guessed(tmp_path, write(tmp_path / "t.csv", lines), {}).exchanges
     found = load_map(tmp_path / "map.toml")
     assert (found.layout, found.columns["stamp"], found.columns["time_s"]) == ("stamps", clock, "timestamp")
     expected = sorted(rows, key=lambda row: row["tx1"] % 2**32)
@@ -155,7 +149,7 @@ def test_tables_with_positions_and_ranges_are_read(tmp_path, mine, other):
 def test_incomplete_positions_are_not_used_and_noted(tmp_path):
     places = dict.fromkeys(("tag_x", "tag_y", "tag_z", "anchor_x", "anchor_y"), 1.5)
     rows = [{"t_s": k, "src": 1, "dst": 2, "range_m": 3.25, **places} for k in range(30)]
-    assert not len(guessed(tmp_path, rows).poses)
+    assert not len(guessed(tmp_path, write(tmp_path / "t.csv", rows), {}).poses)
     assert "missing: to_z_m" in (tmp_path / "map.toml").read_text()
 
 
@@ -169,7 +163,9 @@ def test_zero_third_intervals_give_no_numpy_warning(tmp_path):
 def test_messages_that_are_counted_from_zero(tmp_path, third):
     rows = flights()
     table = [row | {"message": row["message"] - 1} for row in as_messages(wrapped(rows))]
-    e = guessed(tmp_path, [row for row in table if third or row["message"] < 2]).exchanges
+    e = guessed(
+        tmp_path, write(tmp_path / "t.csv", [row for row in table if third or row["message"] < 2]), {}
+    ).exchanges
     names, expected = HEADER[3 : 9 if third else 7], sorted(rows, key=lambda row: row["tx1"] % 2**32)
     found = [row[: len(names)] for row in stamps(e[e.tx1.argsort()])]
     assert found == [[row[n] % 2**32 for n in names] for row in expected]
@@ -188,7 +184,7 @@ def test_the_command_prints_the_next_steps(tmp_path, ids, todo):
 
 def test_words_for_ids_are_noted_with_their_numbers(tmp_path):
     rows = [{"t_s": k, "src": chr(65 + k % 13), "dst": chr(66 + k % 13), "range_m": 3.0} for k in range(60)]
-    (note,) = guessed(tmp_path, rows).meta["notes"]
+    (note,) = guessed(tmp_path, write(tmp_path / "t.csv", rows), {}).meta["notes"]
     text = "14 ids are words or too large, and were numbered: A = 1, B = 2,.*, L = 12 and 2 more; .*"
     assert re.fullmatch(text, note)
 

@@ -18,13 +18,12 @@ from tests.uwblink.importers.test_forms import (
     lines,
     long_rows,
     prints,
-    table,
     trek,
     wide_rows,
     with_ids,
     with_powers,
 )
-from tests.uwblink.importers.test_table_forms import HEADER, flights, wrapped
+from tests.uwblink.importers.test_table_forms import HEADER, flights, wrapped, write
 from uwblink.errors import ImportTableError
 from uwblink.importers import read_source
 from uwblink.importers.guess import guess_map
@@ -49,17 +48,13 @@ FAMILIES = (
 )
 
 
-def time_scale(name):
-    return 1000.0 if name.endswith("_ms") else 1.0
-
-
 def mutated_long(rng, path):
     unit, time, first, other, name = (rng.choice(list(names)) for names in (UNITS, TIMES, FROM, TO, RANGES))
     header = name + ("" if unit.startswith("?") else unit)
     columns = {"t_s": time, "tag": first, "anchor": other, "range_m": header}
     rows = []
     for row in long_rows():
-        row["t_s"] *= time_scale(time)
+        row["t_s"] *= 1000.0 if time.endswith("_ms") else 1.0
         row["range_m"] = round(row["range_m"] * UNITS[unit], 4)
         rows.append({columns.get(key, key): value for key, value in row.items()})
     if rng.random() < 0.5:
@@ -114,7 +109,7 @@ def written(rng, path, rows, value):
         rows = [*rows, dict.fromkeys(rows[0], "") | {next(iter(rows[0])): "mean", value: 3.3}]
     mark, comma = rng.choice([",", ";", "\t"]), rng.random() < 0.2
     text = (lambda v: str(v).replace(".", ",")) if comma and mark != "," else str
-    return table(path.with_suffix(".csv"), rows, mark, rng.random() > 0.1, text)
+    return write(path.with_suffix(".csv"), rows, mark, text, header=rng.random() > 0.1)
 
 
 def mutated_log(rng, path):

@@ -1,26 +1,22 @@
 """Motion-capture poses from files, and the offset of their clock."""
 
+import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import uwbsim
 from tests import processes
 from tests.errors import one_line
-from uwblink import Contents, Exchanges, Poses, Tag, errors, load
-from uwblink.exporters import export_recording
+from uwblink import Contents, Exchanges, Tag, errors, load
 from uwblink.importers import add_poses
 from uwblink.importers.poses import read_poses
 from uwblink.recording.distances import distances_m
-from uwblink.twr import STAMPS
 from uwbsim.boards.server import LivePoses
 from uwbsim.world.world import World
 
-ROOT = Path(__file__).parents[3]
-TEST1 = ROOT / "scenarios" / "icra2023" / "test1.toml"
 HEADER = "time_s,body,x,y,z,qx,qy,qz,qw\n"
 SHIFT_NS = 1_700_000_000_123_456_789
 
@@ -89,7 +85,7 @@ def test_files_without_poses_are_refused(tmp_path, name, text, fragment):
 def flight(tmp_path_factory):
     """A recording in host time without poses, and its motion capture in a file, 3.21 s late."""
     folder = tmp_path_factory.mktemp("flight")
-    scenario = uwbsim.load(TEST1, ["run.duration_s=10"])
+    scenario = uwbsim.load("icra2023/test1", ["run.duration_s=10"])
     simulated = uwbsim.simulate(scenario)
     e = simulated.exchanges
     moved = replace(simulated, poses=simulated.poses[:0], exchanges=replace(e, time_ns=e.time_ns + SHIFT_NS))
@@ -176,9 +172,8 @@ def test_lever_arms_and_ranges_in_other_units_are_refused(flight, copied, tmp_pa
     (tmp_path / "tags.toml").write_text("".join(tables))
     with pytest.raises(errors.ImportTableError, match="lever arms are in mm"):
         add_poses(copied, flight / "p.csv", offset="-3.21", tags_from=tmp_path / "tags.toml")
-    none: dict[str, Any] = dict.fromkeys(STAMPS, np.zeros(len(held), dtype=np.int64))
     for unit, factor in (("mm", 1000.0), ("ns", 1 / 0.299702547)):
-        bare = replace(held, range_m=factor * held.range_m, **none)
+        bare = Exchanges.from_arrays(held.initiator, held.target, range_m=factor * held.range_m, time_ns=held.time_ns)
         Contents(exchanges=bare, tags=tags).save(tmp_path / "other.uwb", force=True)
         with pytest.raises(errors.ImportTableError, match=f"ranges of the recording are in {unit}"):
             add_poses(tmp_path / "other.uwb", flight / "p.csv", offset="-3.21")
@@ -271,23 +266,21 @@ def test_topics_by_body(tmp_path):
 
 @pytest.fixture
 def recording(tmp_path):
-    """A recording of tag 1 on a car, 2 on a drone and anchor 9, and a trajectory of each body in our format."""
+    """A recording of tag 1 on a car, 2 on a drone and anchor 9, and a trajectory of each body."""
     ids = np.array([[1, 2], [1, 9], [2, 9]] * 5)
     when = np.arange(15) * 100_000_000
     e = Exchanges.from_arrays(ids[:, 0], ids[:, 1], time_ns=when, tx1=[0] * 15, rx1=5, tx2=1005, rx2=3000)
     tags = [Tag(k, body, (0.0, 0.0, 0.0)) for k, body in ((1, "car"), (2, "drone"), (9, "tag9"))]
     for body, x in (("car", 0.0), ("drone", 4.0)):
-        poses = Poses.from_arrays(np.arange(20) * 10**8, body, [[x, 0.0, k / 10] for k in range(20)])
-        Contents(exchanges=e, poses=poses).save(tmp_path / "one.uwb", force=True)
-        export_recording(tmp_path / "one.uwb", tmp_path / body, to="tum")
+        (tmp_path / f"{body}.tum").write_text("".join(f"{k / 10} {x} 0 {k / 10} 0 0 0 1\n" for k in range(20)))
     Contents(exchanges=e, tags=tags).save(tmp_path / "r.uwb")
     return tmp_path / "r.uwb"
 
 
 def test_bodies_without_poses_are_named_whether_some_or_no_ranges_have_both_ends(recording, tmp_path):
     """Of the pairs 1-2, 1-9 and 2-9, car and drone have poses, or none."""
-    places, files = tmp_path / "places.toml", ["--from", f"car={tmp_path / 'car' / 'car.tum'}"]
-    done = processes.run("uwblink", "poses", recording, *files, "--from", f"drone={tmp_path / 'drone' / 'drone.tum'}")
+    places, files = tmp_path / "places.toml", ["--from", f"car={tmp_path / 'car.tum'}"]
+    done = processes.run("uwblink", "poses", recording, *files, "--from", f"drone={tmp_path / 'drone.tum'}")
     assert (done.returncode, done.stderr) == (0, "")
     assert "5 of 15 measurements have a true distance; no poses of tag9" in done.stdout
     places.write_text("".join(f'[[tags]]\nid = {k}\nbody = "{name}"\n' for k, name in ((1, "Car"), (2, "car"))))
@@ -298,7 +291,7 @@ def test_bodies_without_poses_are_named_whether_some_or_no_ranges_have_both_ends
 
 def test_trajectories_of_several_bodies_and_anchors(recording, tmp_path):
     (tmp_path / "places.toml").write_text("[[anchors]]\nid = 9\nposition_m = [0.0, 3.0, 0.0]\n")
-    files = {body: tmp_path / body / f"{body}.tum" for body in ("car", "drone")}
+    files = {body: tmp_path / f"{body}.tum" for body in ("car", "drone")}
     found = add_poses(recording, files, tags_from=tmp_path / "places.toml")
     assert (found.bodies, found.covered, found.exchanges) == (("anchor9", "car", "drone"), 15, 15)
     held = load(recording)
@@ -321,5 +314,239 @@ def test_wrong_anchors_are_refused(recording, tmp_path):
     ):
         (tmp_path / "places.toml").write_text(text)
         with pytest.raises(errors.PlanError, match=one_line(fragment)):
-            add_poses(recording, tmp_path / "car" / "car.tum", body="car", tags_from=tmp_path / "places.toml")
+            add_poses(recording, tmp_path / "car.tum", body="car", tags_from=tmp_path / "places.toml")
     assert not load(recording).poses
+
+
+# Exports of motion-capture programs, made here from their descriptions, compared with planted poses and distances.
+
+
+COUNT, RATE = 30, 100.0
+TIMES = np.arange(COUNT) / RATE
+BODIES = {
+    name: (
+        np.random.default_rng(k).normal(size=3) + np.outer(TIMES, [1.0 + k, 2.0, -0.5]),
+        Rotation.from_rotvec(np.outer(TIMES + k, [0.3, -0.2, 0.9])),
+    )
+    for k, name in enumerate(("drone", "car"))
+}
+ARMS = {"drone": (0.1, -0.2, 0.05), "car": (0.0, 0.3, -0.1)}
+
+
+def rows(numbers):
+    """Return a row per frame: the numbers of each body in turn, by a function."""
+    return [[x for name in BODIES for x in numbers(name, k)] for k in range(COUNT)]
+
+
+def lines(path, head, table, mark=","):
+    path.write_text("\n".join([mark.join(map(str, cells)) for cells in [*head, *table]]) + "\n")
+    return path
+
+
+def angles(turned, order):
+    """Return angles about x, y and z in degrees, of successive rotations about the body's own axes, by elements of the
+    matrix.
+
+    R = Rx(a) Ry(b) Rz(c) or Rz(c) Ry(b) Rx(a), multiplied by hand.
+    """
+    r = turned.as_matrix()
+    if order == "XYZ":
+        found = np.arctan2(-r[1, 2], r[2, 2]), np.arcsin(r[0, 2]), np.arctan2(-r[0, 1], r[0, 0])
+    else:
+        found = np.arctan2(r[2, 1], r[2, 2]), -np.arcsin(r[2, 0]), np.arctan2(r[1, 0], r[0, 0])
+    return np.degrees(found)
+
+
+def motive(folder, version="1.23", unit="Millimeters", labelled=True, rotation="Quaternion"):
+    scale = {"Millimeters": 1000.0, "Meters": 1.0}[unit]
+    turns = "XYZ" if len(rotation) == 3 else "XYZW"
+
+    def numbers(name, k):
+        place, turned = BODIES[name][0][k] * scale, BODIES[name][1][k]
+        written = angles(turned, rotation) if turns == "XYZ" else turned.as_quat()
+        return [*written, *place, 0.001, *place]  # followed by a marker of the body
+
+    kinds = ["Rotation"] * len(turns) + ["Position"] * 3 + ["Mean Marker Error"] + ["Position"] * 3
+    axes = [*turns, *"XYZ", "", *"XYZ"]
+    width = len(turns) + 4
+    label = (lambda word: ["", word]) if labelled else lambda _: ["", ""]
+    head = [
+        ["Format Version", version, "Take Name", "Take 1", "Export Frame Rate", RATE, "Rotation Type", rotation,
+         "Length Units", unit, "Coordinate Space", "Global"],
+        [],
+        [*label("Type"), *(["Rigid Body"] * width + ["Rigid Body Marker"] * 3) * 2],
+        [*label("Name"), *(cell for name in BODIES for cell in [name] * width + [f"{name}:Marker 001"] * 3)],
+        [*label("ID"), *["1"] * 2 * (width + 3)],
+        ["", "", *kinds * 2],
+        ["Frame" if labelled else "", "Time (Seconds)" if labelled else "", *axes * 2],
+    ]  # fmt: skip
+    table = [[k, f"{TIMES[k]:.6f}", *cells] for k, cells in enumerate(rows(numbers))]
+    table[3][2 : width + 5] = [""] * (width + 3)  # the first body is lost for a frame
+    return lines(folder / "take.csv", head, table)
+
+
+def vicon(folder, unit="rad", quaternions=False):
+    scale = {"rad": 1.0, "deg": 180 / np.pi}[unit]
+
+    def numbers(name, k):
+        turned = BODIES[name][1][k]
+        return [*(turned.as_quat() if quaternions else turned.as_rotvec() * scale), *BODIES[name][0][k] * 1000]
+
+    width = 7 if quaternions else 6
+    head = [
+        ["Objects"], [int(RATE)],
+        ["", "", *(cell for name in BODIES for cell in [f"Global Angle {name}:{name}"] + [""] * (width - 1))],
+        ["Frame", "Sub Frame", *(["RX", "RY", "RZ", *["RW"] * quaternions, "TX", "TY", "TZ"] * 2)],
+        ["", "", *([unit] * (width - 3) + ["mm"] * 3) * 2],
+    ]  # fmt: skip
+    table = [[k, 0, *cells] for k, cells in enumerate(rows(numbers))]
+    table[3][2 : 2 + width] = [""] * width
+    return lines(folder / "vicon.csv", head, table)
+
+
+def qualisys(folder, time=True):
+    def numbers(name, k):
+        turned = BODIES[name][1][k]
+        return [*BODIES[name][0][k] * 1000, *turned.as_euler("xyz", degrees=True), 0.4, *turned.as_matrix().T.ravel()]
+
+    words = ["Roll", "Pitch", "Yaw", "Residual", *(f"Rot[{k}]" for k in range(9))]
+    head = [
+        ["NO_OF_FRAMES", COUNT], ["NO_OF_BODIES", 2], ["FREQUENCY", int(RATE)],
+        ["TIME_STAMP", "2024-05-06, 07:08:09", "22107.99"], ["DATA_INCLUDED", "6D"], ["BODY_NAMES", *BODIES],
+        ["Frame", *["Time"] * time, *(cell for name in BODIES for cell in [f"{name} X", "Y", "Z", *words])],
+    ]  # fmt: skip
+    table = [[k, *[f"{TIMES[k]:.5f}"] * time, *cells] for k, cells in enumerate(rows(numbers))]
+    table[3][1 + time : 17 + time] = [0.0] * 16
+    return lines(folder / "take_6D.tsv", head, table, "\t")
+
+
+EXPORTS = {
+    "Motive, mm": motive,
+    "Motive, version 1.0, m": lambda folder: motive(folder, "1.0", "Meters", labelled=False),
+    "Motive, angles X, Y, Z": lambda folder: motive(folder, rotation="XYZ"),
+    "Motive, angles Z, Y, X": lambda folder: motive(folder, rotation="ZYX"),
+    "Vicon, rotation vectors in rad": vicon,
+    "Vicon, rotation vectors in degrees": lambda folder: vicon(folder, "deg"),
+    "Vicon, quaternions": lambda folder: vicon(folder, quaternions=True),
+    "Qualisys": qualisys,
+    "Qualisys without times": lambda folder: qualisys(folder, time=False),
+}
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_an_export_of_motion_capture_is_read(tmp_path, name):
+    found = read_poses(EXPORTS[name](tmp_path))
+    assert set(found.body) == set(BODIES)
+    for body, (place, turned) in BODIES.items():
+        seen = np.arange(COUNT) != 3 if body == "drone" else np.full(COUNT, True)
+        own = found.body == body
+        np.testing.assert_allclose(found.time_ns[own] * 1e-9, TIMES[seen], atol=1e-9)
+        np.testing.assert_allclose(found.position_m[own], place[seen], atol=1e-9)
+        apart = Rotation.from_quat(found.quaternion[own]) * turned[np.flatnonzero(seen)].inv()
+        assert apart.magnitude().max() < 1e-6
+
+
+def ranges(times, range_m):
+    """Return ranges from tag 1 to tag 2 without stamps."""
+    count = np.ones(len(times), np.int64)
+    return Exchanges.from_arrays(count, 2, time_ns=np.rint(times * 1e9).astype(np.int64), range_m=range_m)
+
+
+def truth(path):
+    found = load(path)
+    return distances_m(
+        found.poses, found.tags, *(getattr(found.exchanges, n) for n in ("initiator", "target", "time_ns"))
+    )
+
+
+def save_ranges_between(path, arms=ARMS):
+    """Save ranges between the two bodies, exact except for 5 cm, in the middle of frames; return the true distances."""
+    times = TIMES[5:-5] + 0.005
+    places = {
+        name: place[5:-5] + 0.005 * (place[1] - place[0]) * RATE
+        + Rotation.from_rotvec(np.outer(times + k, [0.3, -0.2, 0.9])).apply(arms[name])
+        for k, (name, (place, _)) in enumerate(BODIES.items())
+    }  # fmt: skip
+    true = np.linalg.norm(places["drone"] - places["car"], axis=1)
+    tags = [Tag(k + 1, name, arms[name]) for k, name in enumerate(arms)]
+    Contents(exchanges=ranges(times, true + 0.05), tags=tags).save(path, force=True)
+    return true
+
+
+@pytest.mark.parametrize("name", ["Motive, mm", "Qualisys without times"])
+def test_exports_give_the_planted_distances(tmp_path, name):
+    true = save_ranges_between(tmp_path / "r.uwb")
+    processes.succeed("uwblink", "poses", tmp_path / "r.uwb", "--from", EXPORTS[name](tmp_path))
+    # Between frames, poses are interpolated, and one frame is missing.
+    np.testing.assert_allclose(truth(tmp_path / "r.uwb"), true, atol=1e-4)
+
+
+CSV = "stamp_ms;object;pos_x_mm;pos_y_mm;pos_z_mm"
+MAP = """
+columns = {time_s = "when", body = "what", x = "east", y = "north", z = "up"}
+units = {time = "ms", distance = "mm"}
+"""
+
+
+def test_iso_times(tmp_path):
+    text = "time,body,x,y,z\n" + "".join(
+        f"2024-05-06T07:08:{k:02d}.250{zone},b,{k},0,0\n" for k, zone in enumerate(["", "Z", "+02:00"])
+    )
+    (tmp_path / "p.csv").write_text(text)
+    found = read_poses(tmp_path / "p.csv")
+    assert [time - 1714979280_250_000_000 for time in found.time_ns.tolist()] == [-7198 * 10**9, 0, 10**9]
+
+
+@pytest.mark.parametrize(("head", "text"), [(CSV, None), ("when;what;east;north;up", MAP)])
+def test_columns_with_other_names_and_without_attitudes(tmp_path, head, text):
+    none = dict.fromkeys(BODIES, (0.0, 0.0, 0.0))
+    table = [[1000 * TIMES[k], name, *1000 * BODIES[name][0][k]] for k in range(COUNT) for name in BODIES]
+    source = lines(tmp_path / "p.csv", [[head]], table, ";")
+    words = ["uwblink", "poses", tmp_path / "r.uwb", "--from", source]
+    true = save_ranges_between(words[2], none)
+    if text:
+        processes.refuse(*words, naming=["time_s", "when", "--map"])
+        (tmp_path / "map.toml").write_text(text)
+        words += ["--map", tmp_path / "map.toml"]
+    processes.succeed(*words)
+    np.testing.assert_allclose(truth(words[2]), true, atol=1e-6)
+    save_ranges_between(words[2])
+    processes.refuse(*words, naming=["attitudes", "drone", "lever arm"])
+
+
+@pytest.mark.parametrize(
+    ("name", "broken", "said"),
+    [
+        ("take.csv", lambda folder: motive(folder, rotation="Matrix"), "export quaternions"),
+        ("take.csv", lambda folder: motive(folder).read_text().replace("Rigid Body", "Marker"), "Rigid Body"),
+        ("vicon.csv", lambda folder: vicon(folder).read_text().replace("\n100\n", "\n\n"), "frame rate"),
+        ("take_6D.tsv", lambda folder: qualisys(folder).read_text().replace("Rot[0]", "R"), "Rot[0]"),
+        (
+            "take_6D.tsv",
+            lambda folder: qualisys(folder, False).read_text().replace("FREQUENCY\t100", "FREQUENCY\t0"),
+            "rate",
+        ),
+        ("vicon.csv", lambda folder: vicon(folder).read_text()[:-30], "row 35: column 'T"),
+        ("take.csv", lambda folder: motive(folder).read_text()[:900], "rigid bodies"),
+        ("take.csv", lambda folder: motive(folder).read_text()[:300], "Rotation, Position"),
+    ],
+)
+def test_exports_that_lack_something_are_refused_with_its_name(tmp_path, name, broken, said):
+    text = broken(tmp_path)
+    if isinstance(text, str):
+        (tmp_path / name).write_text(text)
+    with pytest.raises(errors.ImportTableError, match=one_line(said)):
+        read_poses(tmp_path / name)
+
+
+def test_anchors_come_from_json_as_from_toml(tmp_path):
+    places = {1: (0.0, 0.0, 0.0), 2: (3.0, 4.0, 0.0)}
+    rows = [{"id": n, "position_m": list(place)} for n, place in places.items()]
+    (tmp_path / "anchors.json").write_text(json.dumps({"anchors": rows}))
+    text = "".join(f"[[anchors]]\nid = {n}\nposition_m = {list(place)}\n" for n, place in places.items())
+    (tmp_path / "anchors.toml").write_text(text)
+    for name in ("anchors.json", "anchors.toml"):
+        Contents(exchanges=ranges(TIMES, np.full(COUNT, 5.1))).save(tmp_path / f"{name}.uwb")
+        processes.succeed("uwblink", "poses", tmp_path / f"{name}.uwb", "--tags", tmp_path / name)
+        assert truth(tmp_path / f"{name}.uwb") == pytest.approx(5.0)
+    processes.refuse("uwblink", "poses", tmp_path / "anchors.json.uwb", naming=["--from", "--tags"])

@@ -5,7 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
-import time
+import threading
 from dataclasses import replace
 
 import duckdb
@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 from tests import processes
-from tests.boards import record_bench
+from tests.boards import After, record_bench
 from tests.errors import one_line
-from uwblink import Contents, Exchanges, Listener, Poses, RangingPlan, Recording, Tag, errors, load
+from uwblink import Contents, Exchanges, Poses, RangingPlan, Recording, Tag, errors, load
+from uwblink.exporters import export_recording
+from uwblink.recording import store
 from uwblink.recording.schema import TABLES, CirRow, Fault
 from uwblink.twr import COLUMNS
 
@@ -195,17 +197,16 @@ def test_values_that_do_not_fit_undo_their_transaction(tmp_path, write, expected
 
 
 @pytest.fixture
-def older(tmp_path):
-    Contents(exchanges=random_exchanges(0), tags=[Tag(1, "drone", (0.0, 0.0, 0.0))]).save(tmp_path / "older.uwb")
-    change(tmp_path / "older.uwb", *(f"DROP TABLE {table}" for table in LATER))
-    return tmp_path / "older.uwb"
+def older(recording):
+    change(recording, *(f"DROP TABLE {table}" for table in LATER))
+    return recording
 
 
 def test_tables_that_came_later_are_empty(older):
-    with Recording.open(older) as recording:
+    with Recording.open(older) as opened:
         for table in LATER:
-            assert recording.count(table) == recording.show().counts[table] == 0
-            lengths = {name: len(column) for name, column in recording.columns(table).items()}
+            assert opened.count(table) == opened.show().counts[table] == 0
+            lengths = {name: len(column) for name, column in opened.columns(table).items()}
             assert lengths == dict.fromkeys(TABLES[table], 0)
 
 
@@ -217,7 +218,7 @@ def test_an_older_file_is_copied_and_added_to(older, tmp_path):
         recording.append("height", height)
     for path, count in ((older, 1), (tmp_path / "copy.uwb", 0)):
         found = load(path)
-        assert (found.tags[0].body, found.counts().get("height", 0)) == ("drone", count)
+        assert (found.tags[0].body, found.counts().get("height", 0)) == ("a", count)
 
 
 # A recording is read by other processes while it is written: they get all committed rows, and leave no files.
@@ -234,26 +235,15 @@ with uwblink.Recording.create(sys.argv[1], live=True) as recording:
 """
 
 
-class Reader(Listener):
-    """Reads the recording in another process after some number of exchanges, until it has `found` them."""
-
-    def __init__(self, path, at):
-        self.path, self.at, self.turns, self.found = path, at, 0, 0
-
-    def on_turn(self, turn):
-        self.turns += turn.report is not None
-        if self.turns == self.at:
-            until_s = time.monotonic() + 60.0  # the writer commits every 0.1 s, and later under load
-            while self.found != self.at and time.monotonic() < until_s:
-                shown = processes.fork("uwblink", "show", "--json", self.path).stdout
-                self.found = json.loads(shown)["counts"]["exchanges"]
-
-
 def test_another_process_reads_what_is_recorded_so_far(tmp_path):
+    """The writer commits every 0.1 s, and later under load."""
     path = tmp_path / "f's.uwb"
-    reader = Reader(path, 100)
+
+    def committed():
+        return json.loads(processes.fork("uwblink", "show", "--json", path).stdout)["counts"]["exchanges"]
+
+    reader = After(t100=lambda: processes.wait_until(lambda: committed() == 100))
     record_bench(path, RangingPlan(rate_hz=100.0), duration_s=2.0, listeners=[reader])
-    assert reader.found == 100
     assert [p.name for p in tmp_path.iterdir()] == [path.name], "no copy, no log is left"
     assert len(load(path).exchanges) > 100
 
@@ -302,3 +292,174 @@ def test_failed_copies_are_errors_of_the_reader_only(writer, monkeypatch, changi
     ):
         Recording.open(writer)
     assert sorted(p.name for p in writer.parent.iterdir()) == ["f.uwb", "f.uwb.wal"]
+
+
+# Untrusted files: programs in them are refused before they run, and too large contents before they are read.
+
+
+HUGE = "SELECT 'k' AS key, 'v' AS value FROM range(10000000000)"
+ENDLESS = (
+    "WITH RECURSIVE turns(key, value) AS (SELECT 'k', '1' UNION ALL SELECT key, value FROM turns) SELECT * FROM turns"
+)
+
+
+@pytest.mark.parametrize(
+    ("statements", "named"),
+    [
+        (["DROP TABLE meta", f"CREATE VIEW meta AS {HUGE}"], "a view, meta"),
+        (["DROP TABLE meta", f"CREATE VIEW meta AS {ENDLESS}"], "a view, meta"),
+        (["DROP TABLE poses", "CREATE VIEW poses AS SELECT * FROM exchanges, range(1000000)"], "a view, poses"),
+        # Objects that would replace functions of the database, and give false results.
+        (
+            ["CREATE MACRO duckdb_views() AS TABLE SELECT 1 WHERE false", "CREATE VIEW a AS SELECT 1"],
+            "a macro, duckdb_views",
+        ),
+        (["CREATE MACRO duckdb_functions() AS TABLE SELECT 1 WHERE false"], "a macro, duckdb_functions"),
+        (["CREATE MACRO count(a) AS 17"], "a macro, count"),
+        (["CREATE MACRO list_position(a, b) AS 1"], "a macro, list_position"),
+        (["CREATE SCHEMA system"], "a schema, system"),
+        (["CREATE SCHEMA other", "CREATE TABLE other.meta(key TEXT)"], "a schema, other"),
+        (["CREATE TYPE mood AS ENUM ('good')"], "a type, mood"),
+        (["CREATE SEQUENCE s"], "a sequence, s"),
+        (
+            ["DROP TABLE poses", "CREATE TABLE poses(x DOUBLE CHECK (len(range(x::BIGINT * 100000000000)) > 0))"],
+            "a constraint, CHECK",
+        ),
+        (["CREATE INDEX i ON poses((sin(x)))"], "an index, i"),
+        (["ALTER TABLE tags ADD COLUMN w BIGINT DEFAULT 5"], "a computed column or a default, tags.w"),
+        (
+            [
+                "DROP TABLE height",
+                "CREATE TABLE height(time_ns BIGINT, body TEXT, height_m DOUBLE AS (random()) VIRTUAL)",
+            ],
+            "a computed column or a default, height.height_m",
+        ),
+        (["ALTER TABLE tags ALTER tag TYPE VARCHAR"], "column tag is VARCHAR, expected USMALLINT"),
+        (["ALTER TABLE meta ALTER value TYPE STRUCT(a VARCHAR) USING {'a': value}"], "column value is STRUCT"),
+        (['CREATE VIEW "a\nb" AS SELECT 1'], "a view, a\N{REPLACEMENT CHARACTER}b"),
+    ],
+)
+def test_programs_in_a_file_are_refused_in_one_line(recording, statements, named):
+    """Files are opened for reading, and those with two statements for updating."""
+    change(recording, *statements)
+    with pytest.raises(errors.RecordingError, match=one_line("flight.uwb", named)):
+        Recording.open(recording, update=len(statements) == 2)
+
+
+def test_a_trigger_in_a_file_is_refused(recording, tmp_path):
+    with duckdb.connect() as db:
+        if not db.execute("SELECT 1 FROM duckdb_functions() WHERE function_name = 'duckdb_triggers'").fetchall():
+            pytest.skip(f"DuckDB {duckdb.__version__} has no triggers")
+        db.execute(f"ATTACH '{recording}' AS plain (READ_ONLY)")
+        db.execute(f"ATTACH '{tmp_path / 'stranger2.uwb'}' AS stranger (STORAGE_VERSION 'v2.0.0')")
+        db.execute("COPY FROM DATABASE plain TO stranger")
+        db.execute("USE stranger")
+        db.execute("CREATE TRIGGER t AFTER INSERT ON poses FOR EACH STATEMENT DELETE FROM tags")
+    with pytest.raises(errors.RecordingError, match=r"stranger2\.uwb: contains a trigger, t;"):
+        Recording.open(tmp_path / "stranger2.uwb", update=True)
+
+
+def test_recordings_may_have_names_of_databases(recording, tmp_path):
+    for name in ("system", "information_schema", "main", 'a"b;--'):
+        place = tmp_path / f"{name}.uwb"
+        place.write_bytes(recording.read_bytes())
+        with Recording.open(place) as opened:
+            assert len(opened.tags()) == 2
+
+
+def test_an_export_looks_the_file_over_too(recording, tmp_path):
+    change(recording, "DROP TABLE poses", "CREATE VIEW poses AS SELECT 1 AS time_ns")
+    with pytest.raises(errors.RecordingError, match="a view, poses"):
+        export_recording(recording, tmp_path / "out", to="csv")
+    assert not (tmp_path / "out").exists()
+
+
+def test_settings_cannot_be_changed_on_any_connection(recording, tmp_path):
+    with Recording.create(tmp_path / "new.uwb") as written, Recording.open(recording) as opened:
+        for one in (written, opened):
+            for setting in ("enable_external_access = true", "memory_limit = '1MB'"):
+                with pytest.raises(duckdb.InvalidInputException, match="locked"):
+                    one._execute(f"SET {setting}")
+
+
+def test_writers_use_only_the_folder_of_the_recording(tmp_path):
+    (tmp_path / "here").mkdir()
+    with (
+        Recording.create(tmp_path / "here" / "new.uwb", live=True) as recording,
+        pytest.raises(errors.RecordingError, match=r"new.uwb: cannot be written any more .*disabled"),
+    ):
+        recording._execute(f"ATTACH '{tmp_path / 'elsewhere.uwb'}' AS elsewhere")
+    assert not (tmp_path / "elsewhere.uwb").exists()
+
+
+def test_more_rows_than_a_file_can_hold_are_not_read(recording, monkeypatch):
+    change(recording, "INSERT INTO height SELECT 0, 'drone', 1.0 FROM range(3000000)")
+    assert recording.stat().st_size < 3_000_000, "three million rows that are all alike take less than a byte each"
+    with Recording.open(recording) as opened:
+        assert opened.count("height") == 3_000_000
+    monkeypatch.setattr(store, "ROWS_OF_ANY_FILE", 1_000_000)
+    with pytest.raises(errors.RecordingError, match="table height holds 3000000 rows"):
+        Recording.open(recording)
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        ("NULL", "table meta: x has no value"),
+        ("'NaN'", "that of x"),
+        ("'[1, -Infinity]'", "that of x"),
+        ("'[1, -1e400]'", "that of x"),
+        (f"'{'[' * 100_000}'", "that of x"),
+        ("'{'", "that of x"),
+        (f"repeat('9', {store.MOST_META_BYTES})", r"table meta holds 64\d+ bytes, at most 64000000"),
+    ],
+)
+def test_wrong_json_and_too_many_bytes_in_meta_are_refused(recording, value, expected):
+    change(recording, f"INSERT INTO meta VALUES ('x', {value})")
+    with pytest.raises(errors.RecordingError, match=expected) as caught:
+        Recording.open(recording)
+    assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize(
+    ("table", "statement", "said"),
+    [
+        *(
+            (table, f"INSERT INTO {table} VALUES ({row})", f"table {table}: a row with nothing")
+            for table, row in (
+                ("tags", "2, NULL, 0, 0, 0"),
+                ("cirs", "9, 1, 1, 2, NULL, NULL"),
+                ("faults", "9, NULL, 'power', '', NULL, 3"),
+            )
+        ),
+        *(
+            ("arrangements", f"INSERT INTO arrangements VALUES (0, 1, 'A', '{known}')", "known: found")
+            for known in ("line 1 1", "plane 1 2", "line 1 b", "line  1")
+        ),
+        *(
+            (
+                "exchanges",
+                f"UPDATE meta SET value = '{json.dumps(bits)}' WHERE key = 'timestamp_bits'",
+                r"timestamp_bits is .*expected 32 or 40",
+            )
+            for bits in (0, -1, 33, 64, 10**30, True, None, "32", [32], 32.5)
+        ),
+    ],
+)
+def test_missing_values_wrong_orders_and_widths_of_stamps_are_refused_when_they_are_read(
+    recording, table, statement, said
+):
+    change(recording, statement)
+    with Recording.open(recording) as opened, pytest.raises(errors.RecordingError, match=said):
+        getattr(opened, table)()
+
+
+def test_endless_reads_are_interrupted(recording):
+    opened = Recording.open(recording)
+    opened._longest_read_s = 0.3
+    with pytest.raises(errors.RecordingError, match="took longer than 0 s"):
+        opened._select("SELECT sum(a.range * b.range) FROM range(10000000) a, range(10000000) b")
+    opened._longest_read_s = 60.0
+    assert opened._select("SELECT 1 AS one")["one"].tolist() == [1]
+    opened.__exit__(None, None, None)
+    assert not [t for t in threading.enumerate() if isinstance(t, threading.Timer) and not t.finished.is_set()]

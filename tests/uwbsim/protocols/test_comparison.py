@@ -1,22 +1,27 @@
 """Comparisons of protocols and of fleets: their output and their files; test_bad_input.py has their errors."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import BSpline
 
 import uwbsim
 from tests import pages, processes
-from tests.shared_data import ROOT
-from uwblink import PROTOCOLS, SPEED_OF_LIGHT, raw_range
+from tests.errors import one_line
+from tests.uwbsim.simulation.test_protocols import bench
+from uwblink import PROTOCOLS, SPEED_OF_LIGHT, Board, raw_range
 from uwblink.pages import figures
 from uwblink.ticks import TICK_S, elapsed
+from uwblink.twr import COLUMNS
 from uwbsim.protocols.comparison import compare, costs, optimum, over_reply, over_skew
-from uwbsim.protocols.conditions import calibrated, conditions_of, range_errors_m
+from uwbsim.protocols.conditions import Conditions, calibrated, conditions_of, range_errors_m
 from uwbsim.protocols.prediction import broadcast_variances_m2, predict
+from uwbsim.scenario.radio import SIGMA, Radio
 from uwbsim.scenario.ranging import TURNAROUND_S
 
-TEST1 = ROOT / "scenarios" / "icra2023" / "test1.toml"
+TEST1 = "icra2023/test1"
 ROWS = list(PROTOCOLS.values())
 
 
@@ -221,3 +226,254 @@ def test_predict_and_compare_print_the_fleet(tmp_path, monkeypatch):
     compared = ("uwbsim", "compare", "broadcast", "-o", tmp_path / "c", "--protocols", "ds", "-n", "1000")
     assert "6 tags" in processes.succeed(*compared).stdout
     assert "A fleet of 6 tags" in (tmp_path / "c" / "compare.html").read_text()
+
+
+# The Monte Carlo simulation compared with the event loop with its integer stamps, and with theory.
+
+
+NAMES = list(PROTOCOLS)
+SOME_SLOW = [pytest.param(name, marks=[] if name in ("ss", "ds") else pytest.mark.slow) for name in NAMES]
+
+
+def world(count=16_384, **values):
+    """Return a world of five metres, clocks 10 ppm apart, and the boards' delays; `values` change that."""
+    start = {"flight": 5 / SPEED_OF_LIGHT, "rate": (5e-6, -5e-6), "at_once": 305e-6}
+    plain = {k: values.pop(k) for k in list(values) if k in ("quantize", "multipath", "detour_s", "carrier_std_ppm")}
+    one = Conditions.single(**(start | {"scheduled": 1538.7e-6} | values), **plain)
+    return one[np.zeros(count, dtype=np.int64)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_without_contention_the_stamps_are_those_of_the_event_loop(name):
+    settings = [f"ranging.protocol={name}", "ranging.rate_hz=100", "run.duration_s=10"]
+    scenario = uwbsim.load("icra2023/train", settings)
+    loop, columns = uwbsim.simulate(scenario), uwbsim.simulate(scenario, contention=False)
+    for column in COLUMNS:
+        np.testing.assert_array_equal(getattr(loop.exchanges, column), getattr(columns.exchanges, column), column)
+    np.testing.assert_array_equal(loop.truth_m, columns.truth_m)
+
+
+@pytest.mark.parametrize("name", SOME_SLOW)
+def test_means_and_variances_are_those_of_integer_stamps(name):
+    settings = [f"ranging.protocol={name}", "ranging.rate_hz=100", "run.duration_s=300", "radio.tx_noise_ps=40"]
+    scenario = uwbsim.load("icra2023/test1", settings)
+    flight = uwbsim.simulate(scenario, contention=False)
+    exact = raw_range(flight.exchanges) - flight.truth_m
+    # The same 30,000 states, so only the noise differs: 300,000 ranges each.
+    states = conditions_of(scenario, 30_000)
+    fast = range_errors_m(PROTOCOLS[name], states, 7, 300_000)
+    within = predict(PROTOCOLS[name], states).variance_m2.mean()
+    assert abs(exact.mean() - fast.mean()) < 4 * np.sqrt(within * (1 / len(exact) + 1 / len(fast)))
+    # The variance of 30,000 heavy-tailed errors is known to 1.5 %.
+    assert exact.var() == pytest.approx(fast.var(), rel=0.06)
+
+
+@pytest.mark.parametrize("name", SOME_SLOW)
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"rx_std": 150e-12},
+        {"tx_std": 80e-12},
+        {"rx_std": 100e-12, "tx_std": 60e-12, "quantize": True},
+        {"rx_std": 100e-12, "multipath": 0.2, "detour_s": 1e-9},
+        {"rx_std": 50e-12, "carrier_std_ppm": 0.2},
+        {"rx_std": 50e-12, "tx_delay": (0.3e-9, 0.0), "rx_delay": (0.0, -0.5e-9), "late": 0.2e-9},
+        {"rx_std": 50e-12, "flight_rate": 5e-9, "drift": (1e-6, 0.0)},
+    ],
+    ids=lambda v: "+".join(v),
+)
+def test_the_prediction_holds(name, values):
+    c = world(**values)
+    errors = range_errors_m(PROTOCOLS[name], c, 11, 250_000)
+    mean, variance = predict(PROTOCOLS[name], c).pooled()
+    assert abs(errors.mean() - mean) < 4 * np.sqrt(variance / 250_000) + 2e-6
+    # The variance of normal errors is known to 0.3 %, that of exponential detours to 1 %; two sigma of that.
+    assert errors.var() == pytest.approx(variance, rel=0.02)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_without_noise_the_prediction_is_exact(name):
+    c = world(
+        1, tx_delay=(0.3e-9, -0.1e-9), rx_delay=(-0.2e-9, 0.0), late=0.4e-9,
+        flight_rate=4e-9, drift=(2e-6, -1e-6),
+    )  # fmt: skip
+    (error,) = range_errors_m(PROTOCOLS[name], c, 1, 1)
+    # Half a nanometre: the rounding of floats of a second at a millisecond.
+    assert predict(PROTOCOLS[name], c).mean_m[0] == pytest.approx(error, abs=1e-6)
+
+
+BOTH = {"rx_std": 1e-10, "tx_std": 1e-10}
+ONE_SIDED_M2 = (SPEED_OF_LIGHT * 1e-10) ** 2
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "mean_m", "variance_m2"),
+    [
+        ("ss", {"scheduled": 300e-6}, pytest.approx(0.4495, abs=0.0005), 0),
+        *((name, {"scheduled": 300e-6}, pytest.approx(0, abs=0.001), 0) for name in ("ds", "ds-alt", "ds-sym")),
+        ("ss", BOTH | {"rate": (0, 0)}, pytest.approx(0, abs=1e-6), pytest.approx(ONE_SIDED_M2, rel=1e-3)),
+        # ICRA 2023: 1 + r + r^2 times the variance of single-sided ranging, r = dt32/dt53; receive noise alone is half.
+        *(
+            (
+                "ds",
+                noise | {"at_once": r * 1538.7e-6},
+                pytest.approx(0, abs=0.001),
+                pytest.approx(part * ONE_SIDED_M2 * (1 + r + r**2), rel=1e-3),
+            )
+            for r in (0.05, 0.2, 1.0)
+            for noise, part in ((BOTH, 1), ({"rx_std": 1e-10}, 0.5))
+        ),
+        # Neirynck: equal replies halve the weight of each stamp, so 3/4 of the single-sided variance (four stamps with
+        # half the weight, two with all, for both), and the bias is the flight times the mean skew.
+        (
+            "ds-sym",
+            BOTH | {"rate": (12e-6, 4e-6)},
+            pytest.approx(5 * 8e-6, rel=1e-3),
+            pytest.approx(0.75 * ONE_SIDED_M2, rel=1e-3),
+        ),
+    ],
+)
+def test_bias_and_variance_are_those_of_the_papers(name, values, mean_m, variance_m2):
+    found = predict(PROTOCOLS[name], world(1, **values))
+    assert found.mean_m[0] == mean_m
+    assert found.variance_m2[0] == variance_m2
+
+
+def test_carrier_noise_adds_half_the_reply_times_it():
+    c = world(1, carrier_std_ppm=0.2)
+    by_carrier, plain = (predict(PROTOCOLS[name], c) for name in ("ss-cfo", "ss"))
+    expected_m = 0.5 * SPEED_OF_LIGHT * 1538.7e-6 * 0.2e-6
+    assert np.sqrt(by_carrier.parts_m2["carrier integrator"][0]) == pytest.approx(expected_m, rel=1e-6)
+    assert abs(by_carrier.mean_m[0]) < 1e-4
+    assert plain.parts_m2["carrier integrator"][0] == 0
+
+
+@pytest.mark.parametrize("name", [name for name in SIGMA if name != "none"])
+def test_a_double_sided_range_has_the_standard_deviation_of_the_named_curve(name):
+    # The scheduled delay of the boards: replies of 305 us and 1539 us.
+    world = bench(sigma=Radio(sigma=name).sigma, first_path_at_1m_dbm=-78.0)
+    conditions, curve = conditions_of(world), world.radio.sigma
+    lifted = 10 ** ((conditions.power_dbm[0] + 82) / 10)
+    expected = float(BSpline(np.array(curve.knots), np.array(curve.coefficients), curve.degree)(lifted))
+    found = np.sqrt(predict(PROTOCOLS["ds"], conditions).parts_m2["receive noise"][0])
+    assert found == pytest.approx(expected, rel=2e-3)
+
+
+def test_pieces_do_not_depend_on_how_many_are_asked_for():
+    c = world(1000, rx_std=1e-10, carrier_std_ppm=0.2, quantize=True, multipath=0.1, detour_s=1e-9)
+    few, many = (range_errors_m(PROTOCOLS["ss-cfo"], c, 5, n) for n in (2500, 9000))
+    np.testing.assert_array_equal(few, many[:2500])
+
+
+def test_protocols_see_the_same_noise():
+    c = world(4096, rx_std=1e-10)
+    errors = [range_errors_m(PROTOCOLS[name], c, 5, 4096) for name in ("ss", "ss-cfo", "ds")]
+    assert np.corrcoef(errors[0], errors[1])[0, 1] > 0.9999
+    assert np.corrcoef(errors[0], errors[2])[0, 1] > 0.85
+    assert abs(np.corrcoef(errors[0], range_errors_m(PROTOCOLS["ss"], c, 6, 4096))[0, 1]) < 0.08
+
+
+def test_a_world_of_many_states_meets_each_in_turn():
+    c = replace(world(3), flight=np.array([1.0, 2.0, 3.0]) / SPEED_OF_LIGHT, late=np.array([0.0, 1e-9, 2e-9]))
+    errors = range_errors_m(PROTOCOLS["ds"], c, 1, 7)
+    np.testing.assert_allclose(errors, np.array([0, 1, 2, 0, 1, 2, 0]) * 1e-9 * SPEED_OF_LIGHT, atol=1e-4)
+
+
+# Accepted and refused arguments of comparisons: parameters by name, in one line.
+
+
+SHORT = uwbsim.load("noiseless", {"run.duration_s": 2.0, "radio.rx_noise_ps": 100.0})
+WITHOUT_EXCHANGES = uwbsim.load("noiseless", {"run.duration_s": 0.001})
+
+
+def test_protocols_are_names_rows_or_all():
+    row = replace(PROTOCOLS["ds"], name="ds-again")
+    found = uwbsim.compare(SHORT, ["ds", row, PROTOCOLS["ds"]], count=500)
+    assert [one.protocol for one in found.outcomes] == ["ds", "ds-again"]
+    np.testing.assert_array_equal(found.samples["ds"], found.samples["ds-again"])
+    assert [one.protocol for one in uwbsim.compare(SHORT, count=10).outcomes] == list(PROTOCOLS)
+    assert uwbsim.optimum(SHORT, row).delay_s == uwbsim.optimum(SHORT, "ds").delay_s
+    said = uwbsim.predict_state(uwbsim.State(protocol=row))
+    assert said.std_m == uwbsim.predict_state(uwbsim.State(protocol="ds")).std_m
+
+
+def test_a_scenario_may_be_a_file():
+    assert uwbsim.optimum(uwbsim.shipped_scenarios()["noiseless"], "ss").protocol == "ss"
+
+
+def test_results_print_themselves():
+    lines = repr(uwbsim.compare(SHORT, ["ss", "ds"], count=100)).splitlines()
+    assert [line.split()[0] for line in lines] == ["protocol", "ss", "ds"]
+    assert max(map(len, lines)) <= 100
+    assert repr(uwbsim.optimum(SHORT, "ds")).startswith("ds: best delay ")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: uwbsim.compare(SHORT, ["tdoa"]), "`protocols`: found 'tdoa', allowed: ss, ss-cfo, ds"),
+        (lambda: uwbsim.compare(SHORT, []), "`protocols`: found none, allowed"),
+        (lambda: uwbsim.compare(SHORT, ["ss"], count=0), "`count`: found 0, expected 1 to 50000000"),
+        (lambda: uwbsim.optimum(SHORT, "tdoa"), "`protocol`: found 'tdoa'"),
+        (lambda: uwbsim.optimum(SHORT, "ds", -1e-3), "`overhead_s`: found -0.001, expected seconds, 0 or more"),
+        (lambda: uwbsim.optimum(SHORT, "ds", float("nan")), "`overhead_s`: found nan"),
+        (lambda: uwbsim.predict_state(uwbsim.State(protocol="x")), "`protocol`: found 'x'"),
+        (lambda: uwbsim.predict_state(uwbsim.State(skew_ppm=float("inf"))), "`skew_ppm`: found inf, expected a number"),
+        (lambda: uwbsim.predict_state(uwbsim.State(distance_m=-1)), "`distance_m`: found -1, expected 0 or more"),
+        (lambda: uwbsim.predict_state(uwbsim.State(final_delay_us=0.5)), "`final_delay_us`: found 0.5, expected"),
+        (lambda: uwbsim.compare(WITHOUT_EXCHANGES, ["ds"], count=10), "run.duration_s"),
+        (lambda: uwbsim.optimum(WITHOUT_EXCHANGES, "ds"), "run.duration_s"),
+    ],
+)
+def test_wrong_arguments_are_refused(call, message):
+    refused = uwbsim.ScenarioError if message.startswith("run.") else uwbsim.ParameterError
+    with pytest.raises(refused, match=one_line(message)) as caught:
+        call()
+    assert "--" not in str(caught.value)
+
+
+# Effect of white noise of clock rates on protocols: flights, Monte Carlo and prediction compared with closed forms.
+
+
+WHITE = 0.01e-6
+REPLY_S, UUS_S = 305e-6, 512 / 499.2e6
+
+
+def with_white_noise(protocol):
+    return bench(protocol, n=3000, seed=3, tag={"white_ppm_sqrt_s": WHITE * 1e6})
+
+
+def closed_form_m(protocol):
+    """Return the standard deviation from phases that change independently over the intervals of the formulas, without
+    flights.
+    """
+    wait = 1500 * UUS_S
+    if protocol == "ss":
+        # Half of the difference that two clocks gather over the reply.
+        return SPEED_OF_LIGHT * WHITE * np.sqrt(2 * wait) / 2
+    # dt41 - K dt32: both clocks over the reply, and both over the interval that determines K = dt64/dt53.
+    return SPEED_OF_LIGHT * WHITE * np.sqrt(2 * REPLY_S * (1 + REPLY_S / wait)) / 2
+
+
+@pytest.mark.parametrize("protocol", ["ds", "ss", "ss-cfo", "ds-alt", "ds-sym"])
+def test_prediction_monte_carlo_and_flight_agree(protocol):
+    world = with_white_noise(protocol)
+    conditions = conditions_of(world)
+    predicted = np.sqrt(predict(PROTOCOLS[protocol], conditions).pooled()[1])
+    assert np.std(range_errors_m(PROTOCOLS[protocol], conditions, 1, 20_000)) == pytest.approx(predicted, rel=0.03)
+    flight = uwbsim.simulate(world, contention=False)
+    assert np.std(raw_range(flight.exchanges) - flight.truth_m) == pytest.approx(predicted, rel=0.06)
+
+
+@pytest.mark.parametrize("protocol", ["ds", "ss"])
+def test_prediction_has_the_closed_form(protocol):
+    found = predict(PROTOCOLS[protocol], conditions_of(with_white_noise(protocol)))
+    np.testing.assert_allclose(np.sqrt(found.parts_m2["clocks"]), closed_form_m(protocol), rtol=2e-3)
+
+
+@pytest.mark.slow
+def test_served_boards_lose_as_much():
+    first = Board(uwbsim.VirtualPorts(with_white_noise("ds")).port(1))
+    ranges = [first.range(2).range_m for _ in range(200)]
+    # 200 exchanges determine a deviation to 5 %, which includes whole ticks and the grid.
+    assert np.std(ranges) == pytest.approx(closed_form_m("ds"), rel=0.15)

@@ -1,7 +1,6 @@
 """Tags that broadcast in turn and tags that only listen: geometry, planted delays, and loops over frames."""
 
 import json
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,8 +37,7 @@ def world(duration_s=4.0, rate_hz=200.0, places=PLACES, tags=None, radio=None, m
 
 def table(flown):
     """Return the receptions of a flight, or of a recording."""
-    columns: Any = flown.receptions
-    return Receptions(**columns)
+    return Receptions(**flown.receptions)
 
 
 def apart_s(a, b):

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import uwbsim
-from tests.uwbsim.world.helpers import autocorrelation
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT, Board, raw_range
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.protocols.prediction import predict
@@ -29,6 +28,11 @@ def scenario(places=((0.0, 0.0, 1.0), (4.0, 0.0, 1.0)), tags=({}, {}), **more):
         "tags": [{"id": k + 1, "body": n} | tag for k, (n, tag) in enumerate(zip("ab", tags, strict=True))],
     }
     return uwbsim.load(base | more)
+
+
+def autocorrelation(values, lag):
+    centred = values - values.mean()
+    return np.mean(centred[lag:] * centred[:-lag]) / np.mean(centred**2)
 
 
 def link(world, now=5_000_000):
@@ -355,16 +359,11 @@ def long_flight():
 
 
 @pytest.mark.parametrize("pair", EXPECTED)
-def test_pairs_have_their_own_shares(long_flight, pair):
-    share, life_s = EXPECTED[pair]
-    reflected = by_pair(long_flight, pair)[1] > 0.1
+def test_pairs_have_their_own_shares_and_forget_with_their_own_life(long_flight, pair):
+    (share, life_s), residual = EXPECTED[pair], by_pair(long_flight, pair)[1]
     # An hour has 3600/(2 life) independent samples.
-    assert np.mean(reflected) == pytest.approx(share, abs=3 * np.sqrt(share * (1 - share) * 2 * life_s / 3600))
-
-
-@pytest.mark.parametrize("pair", EXPECTED)
-def test_residuals_and_states_forget_with_their_life(long_flight, pair):
-    life_s, residual = EXPECTED[pair][1], by_pair(long_flight, pair)[1]
+    share_std = np.sqrt(share * (1 - share) * 2 * life_s / 3600)
+    assert np.mean(residual > 0.1) == pytest.approx(share, abs=3 * share_std)
     for lag in (1, 4, 10, 20):
         expected = np.exp(-lag * 0.05 / life_s)
         # Lags of a thousandth of the hour: autocorrelations are known to 0.03.

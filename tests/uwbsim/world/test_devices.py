@@ -10,9 +10,10 @@ import pytest
 
 import uwbsim
 from tests.registered import registered
-from tests.uwbsim.world.helpers import served
 from uwblink import PROTOCOLS, SPEED_OF_LIGHT, Board, Recording, raw_range
 from uwblink.ticks import METRES_PER_TICK
+from uwblink.wire.codec import Decoder
+from uwblink.wire.messages import REPORTS, Overheard
 from uwbsim.protocols.conditions import conditions_of, range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.world.channel import CHANNEL_EFFECTS, ChannelEffect
@@ -52,27 +53,31 @@ def errors(world):
     return raw_range(flight.exchanges) - flight.truth_m, flight.exchanges.time_ns * 1e-9
 
 
-def test_a_warm_up_of_20_kelvin_lengthens_ranges_by_86_mm():
-    """Two tags times 2.15 mm/K times 20 K, with the time course of the heat."""
-    cold, warm = (errors(scenario(bodies=[{"temperature_c": t}] * 2, devices=TYPICAL)) for t in (23.0, 43.0))
+HOT = [{"temperature_c": 43.0}] * 2
+
+
+@pytest.mark.parametrize(
+    ("changed", "longer_m"),
+    [
+        ({"bodies": HOT}, 0.086),  # two tags times 2.15 mm/K times 20 K
+        # A tag alone half of that, and a body only where its tag has none.
+        ({"bodies": HOT, "tags": ({"temperature_c": 23.0}, {"range_mm_per_k": 3.0})}, 0.060),
+        ({"bodies": [{"supply_v": 3.2}] * 2}, -0.0107),
+    ],
+)
+def test_ranges_change_with_temperature_and_supply(changed, longer_m):
+    plain = np.mean(errors(scenario(devices=TYPICAL))[0])
+    found = np.mean(errors(scenario(devices=TYPICAL, **changed))[0])
     # The mean of 1000 ranges with 20 ps and whole ticks is known to 0.1 mm.
-    assert np.mean(warm[0]) - np.mean(cold[0]) == pytest.approx(0.086, abs=0.0005)
+    assert found - plain == pytest.approx(longer_m, abs=0.0005)
+
+
+def test_a_warm_up_has_the_time_course_of_the_heat():
+    cold, _ = errors(scenario(devices=TYPICAL))
     error, time_s = errors(scenario(bodies=[{"temperature_c": WARM}] * 2, devices=TYPICAL))
     moved = 0.086 * (1 - np.exp(-time_s / 5.0))
-    assert np.mean(error - moved) == pytest.approx(np.mean(cold[0]), abs=0.0005)
+    assert np.mean(error - moved) == pytest.approx(np.mean(cold), abs=0.0005)
     assert np.polyfit(moved, error, 1)[0] == pytest.approx(1, abs=0.02)
-
-
-def test_a_tag_alone_half_of_that_and_a_body_only_where_its_tag_has_none():
-    bodies = ({"temperature_c": 43.0}, {"temperature_c": 43.0})
-    tags = ({"temperature_c": 23.0}, {"range_mm_per_k": 3.0})
-    cold, one = (errors(scenario(devices=TYPICAL, **more))[0] for more in ({}, {"tags": tags, "bodies": bodies}))
-    assert np.mean(one) - np.mean(cold) == pytest.approx(0.060, abs=0.0005)
-
-
-def test_a_tenth_of_a_volt_less_shortens_ranges_by_10_7_mm():
-    full, less = (errors(scenario(bodies=[{"supply_v": v}] * 2, devices=TYPICAL))[0] for v in (3.3, 3.2))
-    assert np.mean(less) - np.mean(full) == pytest.approx(-0.0107, abs=0.0005)
 
 
 def test_longer_antennas_send_later_than_stamped_and_stamp_later_than_heard():
@@ -222,6 +227,17 @@ def reception(**more):
         },
         more,
     )
+
+
+def served(world):
+    """Range once from tag 1 to tag 2; return the output of the initiator and of the listener, tag 3."""
+    ports = uwbsim.VirtualPorts(world)
+    Board(ports.port(3)).set_passive(True)
+    report = Board(ports.port(1)).range(2)
+    ports.bench.advance(int(ports.bench.env.now) + 50_000_000)
+    heard = b"".join(data for _, tag, data in ports.transfers if tag == 3)
+    (overheard,) = (event for event in Decoder(REPORTS).feed(heard) if isinstance(event, Overheard))
+    return report, overheard
 
 
 def weaken_tag(link, ends):

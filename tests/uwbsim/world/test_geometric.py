@@ -6,7 +6,7 @@ from scipy.integrate import quad
 from scipy.optimize import minimize
 
 import uwbsim
-from tests.uwbsim.world.helpers import autocorrelation
+from tests.uwbsim.world.test_channel import ONE, ZERO, autocorrelation, link
 from uwblink import raw_range
 from uwbsim.scenario.bodies import Material, Obstacle, Shadow
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
@@ -27,7 +27,6 @@ from uwbsim.world.world import SampledWorld, World
 ROOM = {"min_m": [0.0, 0.0, 0.0], "max_m": [8.0, 6.0, 3.0], "roughness_mm": 0.0}
 A, B = (1.0, 2.0, 1.0), (5.0, 3.5, 1.6)
 WAVELENGTH_M = 299_702_547 / 3993.6e6
-ZERO, ONE = np.array([0]), np.array([1])
 
 
 def scenario(*, places=(A, B), motion=None, scatterers=0, stamp_noise=False, **more):
@@ -53,10 +52,6 @@ def world_paths(world, time_s=0.5):
     length = found.detour_m[0][there] + np.linalg.norm(np.subtract(A, B))
     order = np.argsort(length)
     return length[order], found.amplitude[0][there][order]
-
-
-def link(world, time_s=0.5):
-    return World(world).link(ZERO, ONE, np.array([round(time_s * SUBTICKS_PER_SECOND)]))
 
 
 def test_noiseless_stays_exact():
@@ -322,17 +317,16 @@ def test_a_long_thin_wall_is_a_knife_edge(above_m):
         assert -20 * np.log10(abs(1 - cover[0, 0])) == pytest.approx(itu_db(nu), abs=1.0)
 
 
-def test_boxes_beside_the_path_have_no_effect():
-    box = Obstacle(min_m=(6, -1, -1), max_m=(7, 1, 1), material="metal")
-    a, b = np.zeros((2, 3)), np.array([[5.0, 0, 0], [-5.0, 0, 0]])
-    assert np.all(boxes_blocked([box], a, b)[0] == 0)
-
-
 BODY = Shadow(semi_axes_m=(0.3, 0.3, 0.3), loss_db_per_m=1000.0)
 
 
+def past(body, height_m=0.0, begin_m=-2.0):
+    """Return the share of the field that passes a body at the origin, over a path along x to 3 m behind it."""
+    return body_gain(body, np.array([[begin_m, 0, height_m]]), np.array([[3.0, 0, height_m]]))[0]
+
+
 def past_db(height_m):
-    return -20 * np.log10(body_gain(BODY, np.array([[-2.0, 0, height_m]]), np.array([[3.0, 0, height_m]]))[0])
+    return -20 * np.log10(past(BODY, height_m))
 
 
 def test_bodies_have_soft_edges():
@@ -348,22 +342,16 @@ def test_bodies_have_soft_edges():
     assert losses[-1] == 0
 
 
-def test_a_tall_body_is_a_wall_with_two_edges():
+def test_bodies_are_walls_with_two_edges_or_weaken_a_path_or_lie_beside_it():
     tall = Shadow(semi_axes_m=(0.3, 0.3, 30.0), loss_db_per_m=1000.0)
-    loss = -20 * np.log10(body_gain(tall, np.array([[-2.0, 0, 0]]), np.array([[3.0, 0, 0]]))[0])
-    nu = 0.3 * np.sqrt(2 * 5 / (WAVELENGTH_M * 2 * 3))
-    assert loss == pytest.approx(itu_db(nu) - 20 * np.log10(2), abs=0.2), "two fields of as much each"
-
-
-def test_a_body_attenuates_a_path_by_its_loss():
-    mild = Shadow(semi_axes_m=(0.3, 0.3, 0.3), loss_db_per_m=10.0)
-    ends = np.array([[-2.0, 0, 0]]), np.array([[3.0, 0, 0]])
-    past = 10 ** (-past_db(0.0) / 20)
-    assert body_gain(mild, *ends)[0] == pytest.approx(past + (1 - past) * 10 ** (-10 * 0.6 / 20), abs=1e-6)
-
-
-def test_a_body_behind_an_end_does_not_shade():
-    assert body_gain(BODY, np.array([[1.0, 0, 0]]), np.array([[3.0, 0, 0]]))[0] == 1
+    two_fields_db = itu_db(0.3 * np.sqrt(2 * 5 / (WAVELENGTH_M * 2 * 3))) - 20 * np.log10(2)
+    assert -20 * np.log10(past(tall)) == pytest.approx(two_fields_db, abs=0.2)
+    through = past(Shadow(semi_axes_m=(0.3, 0.3, 0.3), loss_db_per_m=10.0))
+    around = past(BODY)
+    assert through == pytest.approx(around + (1 - around) * 10 ** (-10 * 0.6 / 20), abs=1e-6)
+    assert past(BODY, begin_m=1.0) == 1, "behind an end"
+    box = Obstacle(min_m=(6, -1, -1), max_m=(7, 1, 1), material="metal")
+    assert np.all(boxes_blocked([box], np.zeros((2, 3)), np.array([[5.0, 0, 0], [-5.0, 0, 0]]))[0] == 0)
 
 
 COSINES = np.cos(np.radians([0.0, 20.0, 45.0, 70.0, 89.0]))
