@@ -8,7 +8,7 @@ share it and differ only in the source of distances. Surveys use it for the mean
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -25,7 +25,7 @@ from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown
 from calib.pairs import Pairs
 from calib.settings import FitSettings
-from calib.spread import robust_spread
+from calib.spread import less_medians, robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -233,6 +233,28 @@ class RangeModel:
             stated[kind] = values[kind] - constant_m
             stated["delay"] = stated["delay"] - carrier * constant_m / METRES_A_NS
         return stated
+
+    def with_spreads(self, residual: Floats) -> RangeModel:
+        """Return the model with variances of offsets of pairs that are proportional to the spreads of residuals (n,).
+
+        Obstacles and reflections lengthen the ranges of a pair at times, and all the time. Equal variances, or ones
+        proportional to squared spreads, gave errors of delays of 112 and 94 instead of 75 ps (root mean squares, 16
+        flights in two simulated rooms that are not reported); on the MILUV flight the log evidence is lower by 7, or
+        higher by 3.
+        """
+        pair = self.pairs.number
+        away = np.abs(less_medians(residual, pair))
+        # The largest twentieth is cut off: an outlier of 50 m would determine the spread of its pair.
+        squares = np.minimum(away, np.quantile(away, 0.95)) ** 2
+        spread = np.sqrt(np.bincount(pair, squares) / np.bincount(pair)) + HELD_M  # simulated ranges may have no errors
+        shape = np.diag(spread.mean() / spread)
+        unknowns = (
+            replace(u, priors=tuple(replace(prior, structure=shape) for prior in u.priors))
+            if u.kind == "offset of pair"
+            else u
+            for u in self.unknowns
+        )
+        return replace(self, unknowns=tuple(unknowns))
 
     def error_model(self, residual: Floats) -> tuple[Mixture, tuple[Unknown, ...], tuple[Part, ...]]:
         """Return the error model with its unknowns and parts, started from robust spreads of residuals (n,)."""
