@@ -45,9 +45,6 @@ pair grows by more, the likelihood has taken the whole pair for reflections, and
 FIRST_SAMPLE, SAMPLE_GROWTH = 9000, 6
 """Ranges of the first sample on which the likelihood is maximised, and the growth of the next samples."""
 
-ROBUST_LOSS = "cauchy"
-"""The loss of ICRA 2023, for the initial guess."""
-
 SCALE_OF_SPREAD = 0.5
 """Scale of a robust loss over the robust spread of the residuals.
 
@@ -147,7 +144,8 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> RangeFit:
     scale_m = None if settings.scale_ns is None else settings.scale_ns * METRES_A_NS
     if settings.sequential and model.curve is not None and not model.pinned:
         return _fit_in_sequence(model, error, loss, scale_m, blocks)
-    robust, heard = loss if loss != MIXTURE else ROBUST_LOSS, ArrivalModel.of(model)
+    # The loss of ICRA 2023 gives the initial guess of the likelihood.
+    robust, heard = loss if loss != MIXTURE else "cauchy", ArrivalModel.of(model)
     first = ("delay", *model.curve_kinds(), COMMON, OWN, WARMTH, OWN_WARMTH)
     pilot = robust_fit(model, error, robust, scale_m, first, sample=PILOT, heard=heard)
     if heard is not None and pilot.heard is not None:
