@@ -18,7 +18,7 @@ from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, kn
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.covariates import COVARIATES, Covariate
-from calib.estimator.grouped_errors import ReflectionFeatures, error_unknowns, logarithms, scattered
+from calib.estimator.grouped_errors import NOISE_WORTH, ReflectionFeatures, error_unknowns, logarithms, scattered
 from calib.estimator.identifiability import free_directions
 from calib.estimator.range_rows import Errors, Mixture, Part, RangeRows, block_of
 from calib.estimator.rows import NormalRows
@@ -242,11 +242,13 @@ class RangeModel:
         flights in two simulated rooms that are not reported); on the MILUV flight the log evidence is lower by 7, or
         higher by 3.
         """
-        pair = self.pairs.number
+        pair, count = self.pairs.number, np.bincount(self.pairs.number)
         away = np.abs(less_medians(residual, pair))
         # The largest twentieth is cut off: an outlier of 50 m would determine the spread of its pair.
         squares = np.minimum(away, np.quantile(away, 0.95)) ** 2
-        spread = np.sqrt(np.bincount(pair, squares) / np.bincount(pair)) + HELD_M  # simulated ranges may have no errors
+        own = np.log(np.sqrt(np.bincount(pair, squares) / count) + HELD_M)  # simulated ranges may have no errors
+        # The spread of a few ranges is uncertain: the common spread counts for as many as the prior of the noise.
+        spread = np.exp((count * own + NOISE_WORTH * np.average(own, weights=count)) / (count + NOISE_WORTH))
         shape = np.diag(spread.mean() / spread)
         unknowns = (
             replace(u, priors=tuple(replace(prior, structure=shape) for prior in u.priors))
