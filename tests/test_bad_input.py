@@ -298,6 +298,7 @@ OWN = [
       for old, new, named in SCENARIOS),
     *(("uwblink import csv own.csv -o o.uwb", ["own.csv", *named], text) for text, named in TABLES),
     *(("calib fit {f_uwb} -o c.json --group own.toml", ["--group", *named], text) for text, named in GROUPS),
+    ("calib fit {f_uwb} -o c.json --delays-only --group own.toml", ["--group", "--delays-only"], "[groups]\na = [1]"),
     *(("calib evaluate {f_uwb} -c own.json", named, text) for text, named in (
         ("{", ["not JSON"]),
         ("[]", ["not a calibration"]),
