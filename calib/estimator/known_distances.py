@@ -259,7 +259,6 @@ def _convex(optimum: Optimum) -> bool:
 def fit_likelihood(model: RangeModel, error: Floats, pilot: Fitted, heard: ArrivalModel | None = None) -> Fitted:
     """Return the maximum of the likelihood, found from a robust start on samples of growing size and then on all
     ranges."""
-    model = model.with_spreads(pilot.residuals)
     errors, unknowns, parts = model.error_model(pilot.residuals)
     if heard is not None:
         straight = heard.rows(pilot.optimum.layout, errors).residuals(pilot.optimum.x)

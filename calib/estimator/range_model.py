@@ -8,7 +8,7 @@ share it and differ only in the source of distances. Surveys use it for the mean
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -18,14 +18,14 @@ from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, kn
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.covariates import COVARIATES, Covariate
-from calib.estimator.grouped_errors import NOISE_WORTH, ReflectionFeatures, error_unknowns, logarithms, scattered
+from calib.estimator.grouped_errors import ReflectionFeatures, error_unknowns, logarithms, scattered
 from calib.estimator.identifiability import free_directions
 from calib.estimator.range_rows import Errors, Mixture, Part, RangeRows, block_of
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown
 from calib.pairs import Pairs
 from calib.settings import FitSettings
-from calib.spread import less_medians, robust_spread
+from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -233,30 +233,6 @@ class RangeModel:
             stated[kind] = values[kind] - constant_m
             stated["delay"] = stated["delay"] - carrier * constant_m / METRES_A_NS
         return stated
-
-    def with_spreads(self, residual: Floats) -> RangeModel:
-        """Return the model with variances of offsets of pairs that are proportional to the spreads of residuals (n,).
-
-        Obstacles and reflections lengthen the ranges of a pair at times, and all the time. Equal variances, or ones
-        proportional to squared spreads, gave errors of delays of 112 and 94 instead of 75 ps (root mean squares, 16
-        flights in two simulated rooms that are not reported). The MILUV and STAR-loc flights do not decide between the
-        three: their log evidence differs by 2 at most.
-        """
-        pair, count = self.pairs.number, np.bincount(self.pairs.number)
-        away = np.abs(less_medians(residual, pair))
-        # The largest twentieth is cut off: an outlier of 50 m would determine the spread of its pair.
-        squares = np.minimum(away, np.quantile(away, 0.95)) ** 2
-        own = np.log(np.sqrt(np.bincount(pair, squares) / count) + HELD_M)  # simulated ranges may have no errors
-        # The spread of a few ranges is uncertain: the common spread counts for as many as the prior of the noise.
-        spread = np.exp((count * own + NOISE_WORTH * np.average(own, weights=count)) / (count + NOISE_WORTH))
-        shape = np.diag(spread.mean() / spread)
-        unknowns = (
-            replace(u, priors=tuple(replace(prior, structure=shape) for prior in u.priors))
-            if u.kind == "offset of pair"
-            else u
-            for u in self.unknowns
-        )
-        return replace(self, unknowns=tuple(unknowns))
 
     def error_model(self, residual: Floats) -> tuple[Mixture, tuple[Unknown, ...], tuple[Part, ...]]:
         """Return the error model with its unknowns and parts, started from robust spreads of residuals (n,)."""

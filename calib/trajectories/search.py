@@ -216,7 +216,6 @@ class Search:
         Estimating motion and errors alternately can end in a local maximum, because errors that fit a wrong motion
         keep the motion wrong.
         """
-        self.model = self.model.with_spreads(self.residuals())
         mixture, unknowns, parts = self.model.error_model(self.residuals())
         if self.free_ranges < MIN_RANGES_PER_PAIR * len(self.model.pairs.ends):
             unknowns = tuple(u if len(u.names) == 1 else _as_known(u, u.start) for u in unknowns)
