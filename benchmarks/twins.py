@@ -82,10 +82,14 @@ def world(seed: int, duration_s: float) -> dict[str, Any]:
     }
 
 
+LINE = {"knots": [0.0, 0.0, 2.0, 2.0], "coefficients": [0.0, 0.0], "degree": 1}
+"""A curve that is zero at every lifted power."""
+
+
 def known(scenario: Scenario) -> dict[str, Any]:
-    """Return a calibration with the planted values."""
+    """Return a calibration with the planted values; its curve is zero if the scenario has none."""
     planted = scenario.planted()
-    curve = planted["bias_curve"]
+    curve: dict[str, Any] = planted["bias_curve"] or LINE
     shape = curve | {"range": [curve["knots"][0], curve["knots"][-1]]}
     return {
         "schema_version": 3,

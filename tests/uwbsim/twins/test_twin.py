@@ -2,12 +2,12 @@
 
 import json
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 import uwbsim
+from benchmarks.twins import known as planted_calibration
 from calib import Calibration
 from calib.calibration.formats import read_miluv
 from tests import processes
@@ -22,7 +22,6 @@ from uwbsim.twins.flight import TwinFlight, effective_size, lag_one, some_rows
 from uwbsim.twins.range_errors import fit_range_errors, read_calibration
 from uwbsim.world.radio import reception_bias_s
 
-LINE = {"knots": [0.0, 0.0, 2.0, 2.0], "coefficients": [0.0, 0.0], "degree": 1}
 TWO_STATE = {
     "model": "two-state",
     "share": 0.2,
@@ -57,23 +56,7 @@ def world(duration_s=60.0, seed=5, rate_hz=150.0, radio=None, **more):
 
 def known(scenario):
     """Return a calibration with the planted values, as JSON."""
-    planted = uwbsim.load(scenario).planted()
-    curve: dict[str, Any] = planted["bias_curve"] or LINE
-    shape = curve | {"range": [curve["knots"][0], curve["knots"][-1]]}
-    return {
-        "schema_version": 3,
-        "delays_ns": planted["delays_ns"],
-        "delays_std_ns": dict.fromkeys(planted["delays_ns"], 0.0),
-        "loss": "cauchy",
-        "scale_ns": 0.1,
-        "lift": "mean-of-lifted",
-        "power_at": "reception",
-        "alpha_dbm": -82.0,
-        "speed_of_light": 299_702_547.0,
-        "bias_curve": shape,
-        "sigma_curve": shape | {"coefficients": [0.05] * len(curve["coefficients"])},
-        "provenance": {},
-    }
+    return planted_calibration(uwbsim.load(scenario))
 
 
 @pytest.fixture(scope="module")
