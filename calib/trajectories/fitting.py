@@ -21,7 +21,7 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.inverse import Matrix, inverse_of
 from calib.estimator.known_distances import Fitted, RangeFit, model_of, with_covariances
 from calib.estimator.losses import MIXTURE
-from calib.estimator.range_model import BOARD_DELAY_STD_NS, METRES_A_NS, RangeModel
+from calib.estimator.range_model import BOARD_DELAY_STD_NS, DELAY_NS, METRES_A_NS, RangeModel
 from calib.estimator.rows import sum_rows
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
@@ -263,7 +263,9 @@ def _judge_delays(found: RangeFit, top: Search) -> tuple[Ints, Verdict]:
     unpinned = np.intersect1d(layout.indices(["delay"]), layout.free())
     own = unpinned - layout.where["delay"].start
     information = sum_rows([top.rows, *top.gauge], optimum.x).information + optimum.priors.precision()
-    covariance = variance_factor(top.motion.scene) * found.covariances["delay"][np.ix_(own, own)]
+    # Rounding errors of the covariance are not information on the directions that were held.
+    held = DELAY_NS * found.model.held[own]
+    covariance = variance_factor(top.motion.scene) * found.covariances["delay"][np.ix_(own, own)] + held @ held.T
     tags = [found.model.tags[k] for k in own]
     return own, verdict_on(covariance, with_known_distances(information, layout, unpinned), tags)
 
