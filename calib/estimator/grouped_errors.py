@@ -84,10 +84,15 @@ def logarithms(kind: str, names: tuple[str, ...], start: Floats, *priors: Prior)
 
 
 def scattered(
-    kind: str, names: tuple[str, ...], spread: tuple[float, float, float], freedom: float = np.inf
+    kind: str,
+    names: tuple[str, ...],
+    spread: tuple[float, float, float],
+    freedom: float = np.inf,
+    unit: str | None = None,
 ) -> Unknown:
     """Return unknowns about zero whose standard deviation is estimated: its first value and bounds are `spread`."""
-    return Unknown(kind=kind, names=names, start=np.zeros(len(names)), priors=(Prior.of_spread(*spread, freedom),))
+    prior = Prior.of_spread(*spread, freedom, unit)
+    return Unknown(kind=kind, names=names, start=np.zeros(len(names)), priors=(prior,))
 
 
 UNIT_OF_PRIOR = np.array([3.0, 2.0])

@@ -23,8 +23,10 @@ SETTLED = 1e-2
 """A step with a smaller expected gain of log likelihood moves no unknown by more than a tenth of its standard error."""
 
 EVIDENCE_STEPS = 9
-"""Steps near the optimum in which weights of priors are estimated: they converge as fast as the unknowns, then stay.
-Half or twice as many change standard errors of worlds by 4 % (`python -m benchmarks.constants`)."""
+"""Steps near the optimum in which weights of priors are estimated; then they stay. With 9 steps, fits of twelve flights
+with listeners end within 0.18 standard errors from other starts, with 12 within 0.1. With more, variances of zero fall
+to their bounds, and intervals of few ranges become too narrow: those for 95 % contain 93.6 % of the errors with 9
+steps, 93.0 with 12, and 92.6 with 15 (30 worlds of twelve tags with 250 ranges)."""
 
 MOST_STEPS = 100
 """Maximum number of steps of a search: sound searches take ten to sixty."""
@@ -107,6 +109,8 @@ def maximize(  # noqa: PLR0913 - a search has that many sides
             x = best_x + step
             continue
         best_x, sums, shorter = x, found, 0
+        priors.measure(x)
+        value = found.value + priors.value(x)
         precision = priors.precision()
         known = sums.information + precision
         slope = sums.gradient + priors.pull(x)

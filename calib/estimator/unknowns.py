@@ -11,9 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from scipy import sparse
+from scipy.optimize import minimize_scalar
+from scipy.special import logsumexp
 
 from calib.errors import BadInputError
 from calib.estimator.inverse import MOST_DENSE, Inverse, Matrix, trace_of_product
@@ -25,7 +28,9 @@ class Prior:
     """A Gaussian prior with the precision `weight` times `structure` (k, k), about `centre` (k,).
 
     `structure` None is the identity; for many unknowns it is sparse, with `rows` independent rows. With `bounds` the
-    weight is estimated between them, starting at `weight`, from data with `freedom` degrees of freedom.
+    weight is estimated between them, starting at `weight`, from data with `freedom` degrees of freedom. `unit` is the
+    kind of the logarithms (k,) of units: standard deviations are proportional to a power of the units, estimated with
+    the weight between 0 (all are equal) and 1. In layouts without this kind they are equal.
     """
 
     weight: float
@@ -34,6 +39,7 @@ class Prior:
     bounds: tuple[float, float] | None = None
     rows: int | None = None
     freedom: float = math.inf
+    unit: str | None = None
 
     @classmethod
     def of_deviation(cls, deviation: float, centre: Floats | float = 0.0) -> Prior:
@@ -41,15 +47,15 @@ class Prior:
         return cls(weight=deviation**-2, centre=centre)
 
     @classmethod
-    def of_spread(cls, start: float, least: float, most: float, freedom: float = math.inf) -> Prior:
+    def of_spread(
+        cls, start: float, least: float, most: float, freedom: float = math.inf, unit: str | None = None
+    ) -> Prior:
         """Return independent priors about zero, whose standard deviation is estimated between `least` and `most`."""
-        return cls(weight=start**-2, bounds=(most**-2, least**-2), freedom=freedom)
+        return cls(weight=start**-2, bounds=(most**-2, least**-2), freedom=freedom, unit=unit)
 
     def matrix(self, size: int) -> Matrix:
         """Return the structure as a matrix, the identity (size, size) where it is None."""
-        if self.structure is not None:
-            return self.structure
-        return np.eye(size) if size <= MOST_DENSE else sparse.eye(size, format="csc")
+        return _diagonal(np.ones(size)) if self.structure is None else self.structure
 
     def rank(self, matrix: Matrix) -> int:
         """Return the rank of the structure as a `matrix`."""
@@ -128,6 +134,7 @@ class Priors:
         self.keys = [(block.kind, k) for block in layout.blocks for k in range(len(block.priors))]
         self.all = [(layout.where[block.kind], prior) for block in layout.blocks for prior in block.priors]
         self.weights = [prior.weight for _, prior in self.all] if weights is None else list(weights)
+        self.powers = np.full(len(self.all), 0.5)
         self.structures = [prior.matrix(where.stop - where.start) for where, prior in self.all]
         self.ranks = [prior.rank(matrix) for (_, prior), matrix in zip(self.all, self.structures, strict=True)]
         entries = [sparse.coo_matrix(matrix) for matrix in self.structures]
@@ -137,6 +144,20 @@ class Priors:
             np.concatenate([np.zeros(0), *(getattr(one, name) for one in entries)]) for name in ("data", "row", "col")
         )
         self._place = (starts + row.astype(np.int64), starts + column.astype(np.int64))
+
+    def measure(self, x: Floats) -> None:
+        """Scale the structures of priors with units by the units at unknowns (p,)."""
+        for k, (_, prior) in enumerate(self.all):
+            if (logarithm := self._logarithm_of_unit(prior, x)) is not None:
+                own = np.exp(-2 * self.powers[k] * logarithm)
+                self.structures[k], self._data[self._which == k] = _diagonal(own), own
+
+    def _logarithm_of_unit(self, prior: Prior, x: Floats) -> Floats | None:
+        """Return the logarithms of a prior's units (k,) minus their mean, None without a unit in the layout."""
+        if prior.unit not in self.layout.where:
+            return None
+        own = x[self.layout.where[prior.unit]]
+        return np.asarray(own - own.mean())
 
     def by_key(self) -> dict[tuple[str, int], float]:
         """Return the present weights by kind and number of the prior."""
@@ -169,12 +190,19 @@ class Priors:
 
     def update(self, x: Floats, covariance: Inverse) -> None:
         """Estimate the weights with bounds from unknowns (p,) and their covariance (p, p)."""
-        for k, (_, where, away, pulled) in enumerate(self._distances(x)):
-            bounds = self.all[k][1].bounds
-            if bounds is not None:
-                left = self.ranks[k] - self.weights[k] * trace_of_product(covariance, self.structures[k], where)
-                size = max(float(away @ pulled), 1e-300)
-                self.weights[k] = float(np.clip(max(left, 1e-2) / size, *bounds))
+        for k, (where, prior) in enumerate(self.all):
+            if prior.bounds is None:
+                continue
+            away = x[where] - prior.centre
+            if (logarithm := self._logarithm_of_unit(prior, x)) is not None:
+                # The expected likelihood is largest where the scaled squares have the smallest sum.
+                square = np.log(away**2 + np.diag(covariance[where, where]))
+                total = partial(_log_sum_of_scaled, square, logarithm)
+                self.powers[k] = minimize_scalar(total, bounds=(0, 1), method="bounded").x
+                self.measure(x)
+            left = self.ranks[k] - self.weights[k] * trace_of_product(covariance, self.structures[k], where)
+            size = max(float(away @ (self.structures[k] @ away)), 1e-300)
+            self.weights[k] = float(np.clip(max(left, 1e-2) / size, *prior.bounds))
 
     def deviation(self, kind: str) -> float:
         """Return the present standard deviation of the last prior of a kind."""
@@ -185,3 +213,13 @@ class Priors:
         away = [x[where] - prior.centre for where, prior in self.all]
         pulled = [np.asarray(matrix @ own) for matrix, own in zip(self.structures, away, strict=True)]
         return list(zip(self.weights, [where for where, _ in self.all], away, pulled, strict=True))
+
+
+def _diagonal(values: Floats) -> Matrix:
+    """Return a diagonal matrix (k, k), a sparse one for many values (k,)."""
+    return np.diag(values) if len(values) <= MOST_DENSE else sparse.diags(values, format="csc")
+
+
+def _log_sum_of_scaled(square: Floats, logarithm: Floats, power: float) -> float:
+    """Return the logarithm of the sum of squares, given as logarithms (k,), over units (k,) to a power."""
+    return float(logsumexp(square - 2 * power * logarithm))
