@@ -393,18 +393,24 @@ class DescribedErrors:
 
 def described_errors(found: RangeFit) -> DescribedErrors:
     """Return the error model: the fitted one, or one fitted to the residuals of a robust loss."""
-    search, model, location = found.searches[-1], found.model, 0.0
-    values, rows, x = found.values, search.rows, search.optimum.x
-    if isinstance(rows.errors, Mixture):
-        noise = found.covariances["noise"]
-    else:
-        mixture, unknowns, parts = model.error_model(found.residuals)
-        start = np.array([-float(np.median(found.residuals))])
-        centre, everyone = block_of(Unknown(kind="centre", names=("",), start=start), np.zeros((1, 1), dtype=np.int64))
-        layout, rows = model.build(found.residuals, mixture, [centre, *unknowns], [everyone, *parts], only=())
-        optimum, _ = _maximize_by_samples([rows], (), layout, layout.start())
-        x, location, values = optimum.x, -float(optimum.of("centre")[0]), optimum.by_kind()
-        own = layout.indices(noise_kinds(layout))
-        noise = optimum.covariance[:, own][own]
-    slopes = rows.error_slopes(x, (RESIDUAL, "odds"))
-    return DescribedErrors(values=values, noise=noise, slopes=slopes, location_m=location)
+    search = found.searches[-1]
+    if not isinstance(search.rows.errors, Mixture):
+        return errors_of(found.model, found.residuals)
+    slopes = search.rows.error_slopes(search.optimum.x, (RESIDUAL, "odds"))
+    return DescribedErrors(values=found.values, noise=found.covariances["noise"], slopes=slopes, location_m=0.0)
+
+
+def errors_of(model: RangeModel, residual: Floats) -> DescribedErrors:
+    """Return the error model fitted to residuals (n,), in the order of the model's ranges."""
+    mixture, unknowns, parts = model.error_model(residual)
+    start = np.array([-float(np.median(residual))])
+    centre, everyone = block_of(Unknown(kind="centre", names=("",), start=start), np.zeros((1, 1), dtype=np.int64))
+    layout, rows = model.build(residual, mixture, [centre, *unknowns], [everyone, *parts], only=())
+    optimum, _ = _maximize_by_samples([rows], (), layout, layout.start())
+    own = layout.indices(noise_kinds(layout))
+    return DescribedErrors(
+        values=optimum.by_kind(),
+        noise=np.asarray(optimum.covariance[:, own][own]),
+        slopes=rows.error_slopes(optimum.x, (RESIDUAL, "odds")),
+        location_m=-float(optimum.of("centre")[0]),
+    )

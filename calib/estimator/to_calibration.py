@@ -9,7 +9,7 @@ predicted share.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -27,7 +27,7 @@ from calib.estimator.range_rows import RESIDUAL
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
 from calib.range_errors.densities import LONG_FACTOR, LongDetours
 from calib.spread import robust_spread
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
 from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -201,8 +201,7 @@ def _correction_std(found: RangeFit, delays_ns2: Floats, lifted: Floats) -> Floa
     if model.settings.constants == "pair":
         of_pairs = METRES_A_NS**2 * np.diag(delays_ns2)
     else:
-        delays = np.sum(model.pairs.ends[:, :, None] == np.array(model.tags), axis=1) * METRES_A_NS / 2
-        of_pairs = np.sum(delays @ delays_ns2 * delays, axis=1)
+        of_pairs = variance_of_delays(model.pairs.ends, model.tags, delays_ns2)
     if (directions := model.covariates.get("pattern")) is not None:
         # Effects of places that depend on direction are not corrected.
         parts = ((*directions.entries(kind, model.pairs)[1:], found.values[kind]) for kind in OF_PLACES)
@@ -213,6 +212,12 @@ def _correction_std(found: RangeFit, delays_ns2: Floats, lifted: Floats) -> Floa
         splines = basis(lifted, model.curve.knots)
         variance += np.sum(splines @ _bias_covariance(found) * splines, axis=1)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def variance_of_delays(ends: Ints, tags: Sequence[int], delays_ns2: Floats) -> Floats:
+    """Return the variance of ranges of pairs (pairs,), in m^2, by the covariance of delays (tags, tags)."""
+    delays = np.sum(ends[:, :, None] == np.array(tags), axis=1) * METRES_A_NS / 2
+    return np.asarray(np.sum(delays @ delays_ns2 * delays, axis=1))
 
 
 def _bias_covariance(found: RangeFit) -> Floats:

@@ -14,6 +14,7 @@ from calib.calibration.model import Calibration, Uncertainty, matrix_of
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis, flat_curve
 from calib.errors import UnanswerableError
 from calib.estimator.range_model import METRES_A_NS
+from calib.estimator.to_calibration import BETWEEN_M, variance_of_delays
 from calib.findings import Finding, for_provenance, warning
 from calib.information import InformationColumn, Verdict, judge, reduced
 from calib.settings import SurveySettings
@@ -160,6 +161,14 @@ def _calibration(
         curve = Curve(tuple(knots.tolist()), tuple(found.x[where].tolist()), DEGREE, span)
         curve_covariance = found.covariance()[where, where] * interval_factor(freedom) ** 2
         gauge = f"the bias curve is zero at {ALPHA_DBM:g} dBm; the delays contain the common constant"
+    errors = data.errors
+    if errors is not None:
+        # Of pairs that can be corrected; there may be none.
+        ends = network.means.ends[np.isin(network.means.ends, tags).all(axis=1)]
+        splines = basis(np.clip(errors.lifted, *span), np.array(curve.knots))
+        of_curve = np.sum(splines @ curve_covariance * splines, axis=1)
+        correction_m = np.sqrt(variance_of_delays(ends, tags, covariance).sum() / max(len(ends), 1) + of_curve)
+        errors = errors.between(max(found.case.pair_m, BETWEEN_M), correction_m)
     fixed = {"fixed_ns": {str(tag): delay for tag, delay in sorted(network.fixed_ns.items())}}
     provenance = (fixed if network.fixed_ns else {}) | {
         "writer": f"uwbcal {uwblink.__version__}",
@@ -196,6 +205,7 @@ def _calibration(
         sigma_curve=flat_curve(sigma, span),
         provenance=provenance | more,
         uncertainty=Uncertainty(tuple(tags), *map(matrix_of, (covariance, curve_covariance, of_sigma))),
+        errors=errors,
         antenna_delays=known_delays(data.antenna_delays, tags),
     )
 

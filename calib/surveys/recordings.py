@@ -14,13 +14,17 @@ from pathlib import PurePath
 import numpy as np
 from scipy import ndimage, special
 
+from calib.calibration.error_model import ErrorModel
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data, each, opened, ranges_of, refuse_repeated
 from calib.errors import BadInputError, UnanswerableError
+from calib.estimator.known_distances import errors_of
 from calib.estimator.optimize import LONGER, maximize
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, block_of
+from calib.estimator.time_blocks import time_blocks
+from calib.estimator.to_calibration import error_model
 from calib.estimator.unknowns import Prior, Priors, Unknown
 from calib.findings import Finding, warning
 from calib.pairs import Pairs
@@ -69,9 +73,12 @@ class PairMeans(ColumnTable):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyData:
-    """Means of pairs, the arrangements by their numbers, distances in recordings, contradictions and limits."""
+    """Means of pairs, the errors of single ranges about them, the arrangements by their numbers, distances in
+    recordings, contradictions and limits.
+    """
 
     means: PairMeans
+    errors: ErrorModel | None
     arrangements: tuple[Arrangement, ...]
     distances: tuple[KnownDistance, ...]
     sources: tuple[str, ...]
@@ -103,10 +110,11 @@ def read_surveys(data: Data | Iterable[Data], knowledge: Knowledge) -> SurveyDat
             arrangements[one.name] = one
     whole = concatenate([ranges for ranges, _, _ in recordings])
     refuse_repeated(whole.recordings)
-    means, few = pair_means(whole, np.concatenate(numbers))
+    means, errors, few = pair_means(whole, np.concatenate(numbers))
     text = f"{few} pairs of an arrangement have less than 5 ranges and are left out"
     return SurveyData(
         means=means,
+        errors=errors,
         arrangements=tuple(arrangements.values()),
         distances=tuple(distance for _, _, stated in recordings for distance in stated),
         sources=tuple(ranges.source for ranges, _, _ in recordings),
@@ -229,11 +237,11 @@ def find_motion(name: str, ranges: Ranges) -> list[Finding]:
     return [warning("board moved within an arrangement", text, p_value)]
 
 
-def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
-    """Return the means of ranges (n,) whose `arrangement` (n,) is a number, or -1 for none; and the number of pairs
-    with too few ranges.
+def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, ErrorModel | None, int]:
+    """Return the means of ranges (n,) whose `arrangement` (n,) is a number, or -1 for none; the errors of ranges about
+    them; and the number of pairs with too few ranges.
 
-    Pairs of fewer than five ranges in an arrangement are left out; the second value counts them. Raises
+    Pairs of fewer than five ranges in an arrangement are left out; the last value counts them. Raises
     `UnanswerableError` where none is left.
     """
     pairs = ranges.pairs
@@ -247,7 +255,7 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
     rows = rows[np.lexsort((ranges.time_ns[rows], key[rows]))]
     own, group = ranges[rows], np.searchsorted(kept, key[rows])
     ends, count = pairs.ends[kept % len(pairs.ends)], np.bincount(group)
-    range_m, std_m, noise_m = _locations(own, Pairs(group, ends))
+    range_m, std_m, noise_m, errors = _locations(own, Pairs(group, ends))
     forward = own.initiator == ends[group, 0]
     weights = [
         np.bincount(group, np.where(forward == lower, own.weight_initiator, own.weight_target)) / count
@@ -266,11 +274,12 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
         count=count,
         lifted=power,
     )
-    return means, len(keys) - len(kept)
+    return means, errors, len(keys) - len(kept)
 
 
-def _locations(ranges: Ranges, groups: Pairs) -> tuple[Floats, Floats, Floats]:
-    """Return the location of the direct ranges of each group (g,), its standard error, and the noise of a range.
+def _locations(ranges: Ranges, groups: Pairs) -> tuple[Floats, Floats, Floats, ErrorModel | None]:
+    """Return the location of the direct ranges of each group (g,), its standard error, the noise of a range, and the
+    errors of ranges of any group, None for errors without spread.
 
     Ranges are in order of group and time. Slopes of the likelihood are summed over parts of each group's ranges, too:
     errors that last show in these sums.
@@ -300,4 +309,15 @@ def _locations(ranges: Ranges, groups: Pairs) -> tuple[Floats, Floats, Floats]:
     information = np.bincount(group, inverse) * float(np.sum(slope**2) / np.sum(inverse))
     lasting = np.where(count >= 4 * PARTS, np.var(sums, axis=1, ddof=1) * PARTS, 0.0)
     std = np.sqrt(np.maximum(1 / information, lasting / information**2))
-    return median + found.of("mean"), std, np.exp(np.bincount(group, values["noise"]) / count)
+    stated = _errors_of(model, rows.residuals(found.x)) if robust_spread(residual) > 1e-6 else None
+    return median + found.of("mean"), std, np.exp(np.bincount(group, values["noise"]) / count), stated
+
+
+def _errors_of(model: RangeModel, residual: Floats) -> ErrorModel:
+    """Return the error model of residuals (n,) for any pair and power: reflections in a survey belong to its places."""
+    order = np.lexsort((model.ranges.time_ns, model.ranges.session))
+    ranges, own = model.ranges[order], residual[order]
+    one = Pairs(np.zeros(len(own), dtype=np.int32), ranges.pairs.ends[:1])
+    model = replace(model, ranges=ranges, lifted=model.lifted[order], powered=model.powered[order], pairs=one)
+    found = error_model(model, own, errors_of(model, own), time_blocks(ranges.time_ns, ranges.session))
+    return replace(found, pairs={})

@@ -17,7 +17,7 @@ from scipy.stats import t as student
 
 import calib
 import uwblink
-from benchmarks.standing import standing_boards
+from benchmarks.standing import C_M_PER_NS, standing_boards
 from calib.cli.commands import app
 from calib.data.samples import ANCHOR_DELAYS_NS, stamped
 from calib.surveys.knowledge import load_knowledge
@@ -525,3 +525,40 @@ def test_unusable_curves_are_refused(surveyed):
     ):
         with pytest.raises(refused, match=message):
             calib.survey(ranges, known="line", **settings)
+
+
+# The errors of ranges of other recordings, of boards that move: drawn by NumPy from the planted values.
+
+
+@pytest.mark.slow
+def test_a_survey_states_the_errors_of_ranges_of_other_recordings():
+    share, detour_m, noise_m, between_m = 0.05, 0.3, 0.03, 0.05
+    pairs, found = np.array(list(combinations(range(1, 5), 2))), []
+    delays_ns = np.array([0.0, *(ANCHOR_DELAYS_NS[tag] for tag in range(1, 5))])
+    for seed in range(1, 9):
+        rng = np.random.default_rng(seed)
+
+        def detours(count, rng=rng):
+            return np.where(rng.random(count) < share, rng.exponential(detour_m, count), 0.0)
+
+        surveyed = calib.sample_arrangements(6, seed=seed)
+        surveyed = replace(surveyed, raw_m=surveyed.raw_m + detours(len(surveyed)))
+        calibration = calib.survey(surveyed, known="line").calibration
+        stated, pair = calibration.errors, np.arange(4000) % len(pairs)
+        assert stated is not None
+        true_m = rng.uniform(1, 6, len(pair))
+        constant_m = rng.normal(0, between_m, len(pairs)) - 0.5 * C_M_PER_NS * delays_ns[pairs].sum(axis=1)
+        raw_m = true_m + constant_m[pair] + noise_m * rng.normal(size=len(pair)) + detours(len(pair))
+        initiator, target = pairs[pair].T
+        others = calib.Ranges.from_arrays(raw_m, initiator=initiator, target=target, truth_m=true_m)
+        judged = calib.evaluate(others, calibration).overall
+        mean_m = stated.mean_m(stated.shapes(np.ones(1), initiator[:1], target[:1]))[0]
+        found.append([stated.tail_share[0], mean_m, judged.inside_95, judged.total_std])
+    shares, means, inside, total = np.mean(found, axis=0)
+    # 3600 ranges determine a share to 0.4 percentage points, eight surveys to 0.13; short detours count as noise.
+    assert shares == pytest.approx(share, abs=0.006)
+    assert means == pytest.approx(share * detour_m, rel=0.1)
+    # Constants of six pairs, and delays of one survey, are common to ranges: shares of surveys vary by 4 percentage
+    # points, standard deviations by 13 %; the tolerance is twice that of their mean.
+    assert inside == pytest.approx(0.95, abs=0.03)
+    assert total == pytest.approx(1.0, abs=0.1)
