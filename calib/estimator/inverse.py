@@ -108,3 +108,11 @@ def trace_of_product(inverse: Inverse, matrix: Matrix, where: slice = slice(None
     if sparse.issparse(matrix):
         return float(matrix.multiply(inverse[where, where]).sum())
     return float(np.sum(inverse[where, where] * matrix))
+
+
+def variances(inverse: Inverse, where: slice) -> Floats:
+    """Return the diagonal (k,) of the block `where` of an inverse; for a sparse one its mean, estimated, k times."""
+    if not isinstance(inverse, SparseInverse):
+        return np.diag(inverse[where, where])
+    count = where.stop - where.start
+    return np.full(count, trace_of_product(inverse, sparse.eye(count, format="csc"), where) / count)

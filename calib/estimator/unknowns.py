@@ -19,7 +19,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import logsumexp
 
 from calib.errors import BadInputError
-from calib.estimator.inverse import MOST_DENSE, Inverse, Matrix, trace_of_product
+from calib.estimator.inverse import MOST_DENSE, Inverse, Matrix, trace_of_product, variances
 from uwblink.arrays import Bools, Floats, Ints
 
 
@@ -196,7 +196,7 @@ class Priors:
             away = x[where] - prior.centre
             if (logarithm := self._logarithm_of_unit(prior, x)) is not None:
                 # The expected likelihood is largest where the scaled squares have the smallest sum.
-                square = np.log(away**2 + np.diag(covariance[where, where]))
+                square = np.log(away**2 + variances(covariance, where))
                 total = partial(_log_sum_of_scaled, square, logarithm)
                 self.powers[k] = minimize_scalar(total, bounds=(0, 1), method="bounded").x
                 self.measure(x)

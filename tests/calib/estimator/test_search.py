@@ -9,7 +9,7 @@ from scipy import optimize, sparse
 import calib
 from benchmarks.worlds import FIRST_REPORTED, Recipe, make
 from calib.estimator import rows, unknowns
-from calib.estimator.grouped_errors import fit_grouped_errors
+from calib.estimator.grouped_errors import fit_grouped_errors, scattered
 from calib.estimator.inverse import SparseInverse, inverse_of, trace_of_product
 from calib.estimator.known_distances import fit_known_distances
 from calib.estimator.optimize import maximize
@@ -50,6 +50,29 @@ def test_a_search_ends_at_least_squares_and_finds_the_weight_of_its_prior(most, 
     assert priors.deviation("path") == pytest.approx(0.5, rel=0.15)
     precision = priors.weights[0] * (steps.T @ steps).toarray() + np.eye(200) / 0.01
     assert found.x == pytest.approx(np.linalg.solve(precision, seen / 0.01), abs=1e-4)
+
+
+@pytest.mark.parametrize("most", [0, 400])
+def test_a_search_finds_the_power_of_units_of_a_prior(most, monkeypatch):
+    """Standard deviations of 0.5 m times units to the power of 0.6; the values are measured with 0.1 m of noise."""
+    for module in (rows, unknowns):
+        monkeypatch.setattr(module, "MOST_DENSE", most)
+    rng, names = np.random.default_rng(2), ("",) * 400
+    unit = rng.normal(0, 1, 400)
+    seen = 0.5 * np.exp(0.6 * (unit - unit.mean())) * rng.normal(size=400) + rng.normal(0, 0.1, 400)
+    blocks = (
+        unknowns.Unknown(kind="unit", names=names, start=unit, known=np.ones(400, dtype=bool)),
+        scattered("offset", names, (0.1, 1e-3, 10.0), unit="unit"),
+    )
+    layout = unknowns.Layout(blocks)
+    every = NormalRows(
+        value=seen, std=np.full(400, 0.1), entries=np.ones((400, 1)), columns=400 + np.arange(400)[:, None]
+    )
+    priors = unknowns.Priors(layout)
+    assert maximize([every], priors, layout.start(), tolerance=1e-6).success
+    # 400 values determine a standard deviation and a power to 0.035 (the root of 1/800).
+    assert priors.deviation("offset") == pytest.approx(0.5, rel=0.1)
+    assert priors.powers.tolist() == pytest.approx([0.6], abs=0.1)
 
 
 # The end of a search is the same for different starts near it.
