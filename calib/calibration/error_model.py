@@ -152,7 +152,8 @@ class ErrorModel:
 
         `between_m` is the standard deviation of a pair's constant error between recordings. `correction_m` (nodes,) are
         the standard deviations of the correction at the powers `lifted`, by the uncertainty of delays and curve. Both
-        are equal for all pairs, so the factors of pairs on noise shrink towards 1.
+        are equal for all pairs, so the factors of pairs on noise shrink towards 1. The scale is that of the fitted
+        errors: the added noise has its own size.
         """
         noise_m = np.hypot(np.hypot(self.noise_m, between_m), correction_m)
         own, added = np.median(self.noise_m), np.hypot(between_m, np.median(correction_m))
@@ -160,7 +161,10 @@ class ErrorModel:
             name: replace(one, noise=float(np.hypot(one.noise * own, added) / np.hypot(own, added)))
             for name, one in self.pairs.items()
         }
-        return replace(self, noise_m=tuple(noise_m.tolist()), between_m=between_m, pairs=pairs)
+        typical = ErrorShapes(noise_m=own, tail_share=np.median(self.tail_share), detour_m=self.detour_m)
+        fitted_m = float(self.total_m(typical))
+        scale = self.scale * float(np.hypot(fitted_m, added) / np.hypot(fitted_m, self.scale * added))
+        return replace(self, noise_m=tuple(noise_m.tolist()), between_m=between_m, pairs=pairs, scale=scale)
 
     def within_m(self, noise_m: Floats) -> Floats:
         """Return the part of the noise of ranges (n,), in metres, that varies within a recording.

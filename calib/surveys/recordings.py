@@ -19,6 +19,7 @@ from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data, each, opened, ranges_of, refuse_repeated
 from calib.errors import BadInputError, UnanswerableError
+from calib.estimator.grouped_errors import SCATTER
 from calib.estimator.known_distances import errors_of
 from calib.estimator.optimize import LONGER, maximize
 from calib.estimator.range_model import RangeModel
@@ -319,5 +320,10 @@ def _errors_of(model: RangeModel, residual: Floats) -> ErrorModel:
     ranges, own = model.ranges[order], residual[order]
     one = Pairs(np.zeros(len(own), dtype=np.int32), ranges.pairs.ends[:1])
     model = replace(model, ranges=ranges, lifted=model.lifted[order], powered=model.powered[order], pairs=one)
-    found = error_model(model, own, errors_of(model, own), time_blocks(ranges.time_ns, ranges.session))
-    return replace(found, pairs={})
+    found = errors_of(model, own)
+    # All ranges are fitted as one pair, whose factors belong to the common values.
+    alike = {f"{name} of pair": np.zeros(1) for name in SCATTER}
+    common = {f"{name} level": found.values[f"{name} level"] + found.values[f"{name} of pair"] for name in SCATTER}
+    found = replace(found, values={**found.values, **common, **alike})
+    stated = error_model(model, own, found, time_blocks(ranges.time_ns, ranges.session))
+    return replace(stated, pairs={})

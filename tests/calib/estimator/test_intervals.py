@@ -1,5 +1,6 @@
 """Parts of the intervals of a fit: persistence of errors, small samples, reflections."""
 
+import math
 from dataclasses import replace
 from itertools import combinations
 from typing import Any
@@ -263,6 +264,15 @@ def test_between_m_is_in_the_total_sigma_and_equal_for_pairs_with_little_and_muc
     # The factors of pairs use the median over the powers, which causes a few per cent.
     assert noise[1] ** 2 - noise[0] ** 2 == pytest.approx(np.full(len(ranges), 0.05**2), rel=0.1)
     assert stated.errors.within_m(noise[1]) == pytest.approx(noise[0], rel=0.1)
+
+
+def test_what_differs_between_recordings_has_its_size_if_nothing_is_reflected():
+    rng, pairs = np.random.default_rng(5), np.array(list(combinations(range(6), 2)))
+    nothing, noise_m = np.zeros(len(pairs)), np.full(len(pairs), 0.03)
+    ranges, _ = ranges_with_offsets(rng, pairs, rng.normal(0, 0.3, 6), nothing, noise_m)
+    total = calib.fit(ranges, between_m=0.05).calibration.apply(ranges).sigma_total_m
+    # 300 ranges of a pair determine its noise to 4 %.
+    assert np.median(total) == pytest.approx(math.hypot(0.03, 0.05), rel=0.05)
 
 
 @pytest.fixture(scope="module")

@@ -552,9 +552,13 @@ def test_a_survey_states_the_errors_of_ranges_of_other_recordings():
         initiator, target = pairs[pair].T
         others = calib.Ranges.from_arrays(raw_m, initiator=initiator, target=target, truth_m=true_m)
         judged = calib.evaluate(others, calibration).overall
-        mean_m = stated.mean_m(stated.shapes(np.ones(1), initiator[:1], target[:1]))[0]
-        found.append([stated.tail_share[0], mean_m, judged.inside_95, judged.total_std])
-    shares, means, inside, total = np.mean(found, axis=0)
+        shapes = stated.shapes(np.ones(1), initiator[:1], target[:1])
+        # The uncertainty of the delays is a part of the noise.
+        sums_m = [0.5 * C_M_PER_NS * calibration.std_of_sum_ns(pair) for pair in pairs.tolist()]
+        noise = math.sqrt(stated.within_m(shapes.noise_m)[0] ** 2 - np.mean(np.square(sums_m)))
+        found.append([stated.tail_share[0], stated.mean_m(shapes)[0], noise, judged.inside_95, judged.total_std])
+    shares, means, noise, inside, total = np.mean(found, axis=0)
+    assert noise == pytest.approx(noise_m, rel=0.05)
     # 3600 ranges determine a share to 0.4 percentage points, eight surveys to 0.13; short detours count as noise.
     assert shares == pytest.approx(share, abs=0.006)
     assert means == pytest.approx(share * detour_m, rel=0.1)
