@@ -176,8 +176,9 @@ class Air:
             next_begin[host] = never
             if self._alone(number, begin):
                 self.outcomes.start[number] = begin + self._before
+                initiator, target = self._ends[number]
                 end = begin + self._lengths[number]
-                self._busy_until.update(dict.fromkeys(self._ends[number], end))
+                self._busy_until[initiator] = self._busy_until[target] = end
             else:
                 next_begin[host] = 0
                 if self._pause[number]:
