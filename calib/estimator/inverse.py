@@ -111,7 +111,10 @@ def trace_of_product(inverse: Inverse, matrix: Matrix, where: slice = slice(None
 
 
 def variances(inverse: Inverse, where: slice) -> Floats:
-    """Return the diagonal (k,) of the block `where` of an inverse; for a sparse one its mean, estimated, k times."""
+    """Return the diagonal (k,) of the block `where` of an inverse.
+
+    For a sparse one, each value is the mean of the diagonal, which is estimated.
+    """
     if not isinstance(inverse, SparseInverse):
         return np.diag(inverse[where, where])
     count = where.stop - where.start

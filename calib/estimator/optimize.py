@@ -109,7 +109,7 @@ def maximize(  # noqa: PLR0913 - a search has that many sides
             x = best_x + step
             continue
         best_x, sums, shorter = x, found, 0
-        priors.measure(x)
+        priors.scale_by_units(x)
         value = found.value + priors.value(x)
         precision = priors.precision()
         known = sums.information + precision

@@ -321,7 +321,7 @@ def _offsets(ranges: Ranges, pairs: Pairs, tags: list[int], *, freedom: int) -> 
     """Yield offsets of pairs, if ranges determine some, and of pairs and tags in each of several sessions."""
     number, count = pairs.number[:, None], len(ranges.sessions)
     if freedom > 0:
-        # Obstacles and reflections lengthen ranges of a pair at times, and all the time (docs/theory.md).
+        # An obstacle makes the ranges of a pair noisy, and changes their mean.
         block = scattered("offset of pair", pairs.names, OFFSETS, freedom, unit="noise of pair")
         yield block_of(block, number)
     if count < 2:

@@ -134,6 +134,7 @@ class Priors:
         self.keys = [(block.kind, k) for block in layout.blocks for k in range(len(block.priors))]
         self.all = [(layout.where[block.kind], prior) for block in layout.blocks for prior in block.priors]
         self.weights = [prior.weight for _, prior in self.all] if weights is None else list(weights)
+        # Of units, by prior: the first value is the middle of the possible ones.
         self.powers = np.full(len(self.all), 0.5)
         self.structures = [prior.matrix(where.stop - where.start) for where, prior in self.all]
         self.ranks = [prior.rank(matrix) for (_, prior), matrix in zip(self.all, self.structures, strict=True)]
@@ -145,8 +146,8 @@ class Priors:
         )
         self._place = (starts + row.astype(np.int64), starts + column.astype(np.int64))
 
-    def measure(self, x: Floats) -> None:
-        """Scale the structures of priors with units by the units at unknowns (p,)."""
+    def scale_by_units(self, x: Floats) -> None:
+        """Set the structures of priors with units to the units at unknowns (p,), to their present powers."""
         for k, (_, prior) in enumerate(self.all):
             if (logarithm := self._logarithm_of_unit(prior, x)) is not None:
                 own = np.exp(-2 * self.powers[k] * logarithm)
@@ -199,7 +200,7 @@ class Priors:
                 square = np.log(away**2 + variances(covariance, where))
                 total = partial(_log_sum_of_scaled, square, logarithm)
                 self.powers[k] = minimize_scalar(total, bounds=(0, 1), method="bounded").x
-                self.measure(x)
+                self.scale_by_units(x)
             left = self.ranks[k] - self.weights[k] * trace_of_product(covariance, self.structures[k], where)
             size = max(float(away @ (self.structures[k] @ away)), 1e-300)
             self.weights[k] = float(np.clip(max(left, 1e-2) / size, *prior.bounds))

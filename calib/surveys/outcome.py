@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 import uwblink
+from calib.calibration.error_model import ErrorModel
 from calib.calibration.model import Calibration, Uncertainty, matrix_of
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis, flat_curve
 from calib.errors import UnanswerableError
@@ -29,7 +30,7 @@ from calib.surveys.result import (
     SurveyResult,
 )
 from calib.surveys.solution import PAIR_PRIOR_FREEDOM, Solution
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
 from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -79,7 +80,12 @@ def result_of(
         **for_provenance(findings),
     }
     return SurveyResult(
-        calibration=_calibration(data, found, verdict, taken, more),
+        calibration=_with_errors(
+            _calibration(data, found, verdict, taken, more),
+            data.errors,
+            max(found.case.pair_m, BETWEEN_M),
+            network.means.ends,
+        ),
         arrangements=arrangements,
         verdict=verdict,
         pair_error_m=found.case.pair_m,
@@ -161,14 +167,6 @@ def _calibration(
         curve = Curve(tuple(knots.tolist()), tuple(found.x[where].tolist()), DEGREE, span)
         curve_covariance = found.covariance()[where, where] * interval_factor(freedom) ** 2
         gauge = f"the bias curve is zero at {ALPHA_DBM:g} dBm; the delays contain the common constant"
-    errors = data.errors
-    if errors is not None:
-        # Of pairs that can be corrected; there may be none.
-        ends = network.means.ends[np.isin(network.means.ends, tags).all(axis=1)]
-        splines = basis(np.clip(errors.lifted, *span), np.array(curve.knots))
-        of_curve = np.sum(splines @ curve_covariance * splines, axis=1)
-        correction_m = np.sqrt(variance_of_delays(ends, tags, covariance).sum() / max(len(ends), 1) + of_curve)
-        errors = errors.between(max(found.case.pair_m, BETWEEN_M), correction_m)
     fixed = {"fixed_ns": {str(tag): delay for tag, delay in sorted(network.fixed_ns.items())}}
     provenance = (fixed if network.fixed_ns else {}) | {
         "writer": f"uwbcal {uwblink.__version__}",
@@ -205,9 +203,25 @@ def _calibration(
         sigma_curve=flat_curve(sigma, span),
         provenance=provenance | more,
         uncertainty=Uncertainty(tuple(tags), *map(matrix_of, (covariance, curve_covariance, of_sigma))),
-        errors=errors,
         antenna_delays=known_delays(data.antenna_delays, tags),
     )
+
+
+def _with_errors(calibration: Calibration, errors: ErrorModel | None, between_m: float, ends: Ints) -> Calibration:
+    """Return a calibration with an error model of ranges of other recordings.
+
+    `errors` are those of ranges about the means of pairs, `between_m` is the standard deviation of the constant error
+    of a pair, and `ends` (n, 2) are the surveyed pairs, whose corrections have uncertain delays and curve.
+    """
+    if errors is None:
+        return calibration
+    tags, curve = list(calibration.delays_ns), calibration.bias_curve
+    corrected = ends[np.isin(ends, tags).all(axis=1)]
+    # There may be no such pair.
+    variance = variance_of_delays(corrected, tags, calibration.covariance_ns2(tags)).sum() / max(len(corrected), 1)
+    splines = basis(np.clip(errors.lifted, *curve.range), np.array(curve.knots))
+    of_curve = np.sum(splines @ calibration.curve_covariance_m2 * splines, axis=1)
+    return replace(calibration, errors=errors.between(between_m, np.sqrt(variance + of_curve)))
 
 
 def widened_by(found: Solution, curve: Calibration) -> Solution:

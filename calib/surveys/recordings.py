@@ -310,18 +310,21 @@ def _locations(ranges: Ranges, groups: Pairs) -> tuple[Floats, Floats, Floats, E
     information = np.bincount(group, inverse) * float(np.sum(slope**2) / np.sum(inverse))
     lasting = np.where(count >= 4 * PARTS, np.var(sums, axis=1, ddof=1) * PARTS, 0.0)
     std = np.sqrt(np.maximum(1 / information, lasting / information**2))
-    stated = _errors_of(model, rows.residuals(found.x)) if robust_spread(residual) > 1e-6 else None
+    stated = _errors_of_any_pair(model, rows.residuals(found.x)) if robust_spread(residual) > 1e-6 else None
     return median + found.of("mean"), std, np.exp(np.bincount(group, values["noise"]) / count), stated
 
 
-def _errors_of(model: RangeModel, residual: Floats) -> ErrorModel:
-    """Return the error model of residuals (n,) for any pair and power: reflections in a survey belong to its places."""
+def _errors_of_any_pair(model: RangeModel, residual: Floats) -> ErrorModel:
+    """Return the error model of residuals (n,) in metres, with the same values for all pairs and powers.
+
+    A pair in an arrangement has its own reflections, which do not predict those at other places.
+    """
     order = np.lexsort((model.ranges.time_ns, model.ranges.session))
     ranges, own = model.ranges[order], residual[order]
     one = Pairs(np.zeros(len(own), dtype=np.int32), ranges.pairs.ends[:1])
     model = replace(model, ranges=ranges, lifted=model.lifted[order], powered=model.powered[order], pairs=one)
     found = errors_of(model, own)
-    # All ranges are fitted as one pair, whose factors belong to the common values.
+    # All ranges are fitted as one pair, so its factors are a part of the common values.
     alike = {f"{name} of pair": np.zeros(1) for name in SCATTER}
     common = {f"{name} level": found.values[f"{name} level"] + found.values[f"{name} of pair"] for name in SCATTER}
     found = replace(found, values={**found.values, **common, **alike})

@@ -176,9 +176,8 @@ class Air:
             next_begin[host] = never
             if self._alone(number, begin):
                 self.outcomes.start[number] = begin + self._before
-                initiator, target = self._ends[number]
+                # All later exchanges begin after it, so its boards need no entry in `_busy_until`.
                 end = begin + self._lengths[number]
-                self._busy_until[initiator] = self._busy_until[target] = end
             else:
                 next_begin[host] = 0
                 if self._pause[number]:

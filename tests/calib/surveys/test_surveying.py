@@ -566,3 +566,15 @@ def test_a_survey_states_the_errors_of_ranges_of_other_recordings():
     # points, standard deviations by 13 %; the tolerance is twice that of their mean.
     assert inside == pytest.approx(0.95, abs=0.03)
     assert total == pytest.approx(1.0, abs=0.1)
+
+
+def test_errors_of_other_recordings_contain_the_uncertainty_of_delays():
+    pairs, sizes = list(combinations(range(1, 5), 2)), []
+    for pair_error_m in (0.01, 0.05):
+        found = calib.survey(calib.sample_arrangements(), known="line", pair_error_m=pair_error_m).calibration
+        sums_m = [0.5 * C_M_PER_NS * found.std_of_sum_ns(pair) for pair in pairs]
+        sizes.append((np.mean(np.square(sums_m)), found.errors.noise_m[0] ** 2))
+    (less, alone), (more, both) = sizes
+    # At pair errors of 1 cm the noise of a range is 3 cm.
+    assert more > 0.02**2
+    assert both - alone == pytest.approx(more - less, rel=0.02)
