@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, PPoly
+from scipy.special import expit
 
 from calib.estimator.inverse import Inverse, diagonal_of
 from calib.estimator.losses import Weights
@@ -27,9 +28,6 @@ RESIDUAL = "residual"
 
 OF_ERRORS = ("noise", "odds", "detour", "least", "outliers", "long")
 """The other parameters of an error's density; differences of arrival have "side" besides."""
-
-SHARED = "shared"
-"""Name of the part of a residual's slope that the other parameters have, too."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,6 +63,17 @@ class Geometry(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeInformation:
+    """Information of rows (n,): `residual` (n,) is that of residuals if all other parameters are fitted, too.
+
+    The rest is the sum of the outer squares of `directions`: slopes, (n,) or (1,), by each parameter and the residual.
+    """
+
+    residual: Floats
+    directions: tuple[dict[str, Floats], ...] = ()
+
+
 class Errors(Protocol):
     """The density of residuals."""
 
@@ -78,10 +87,10 @@ class Errors(Protocol):
         """Return the ratio of the variance of sums of slopes to the variance for independent draws of the density."""
         ...
 
-    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
-        """Return log densities (n,), slopes by each parameter (n,) and the information of a residual (n,), or None.
+    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], RangeInformation | None]:
+        """Return log densities (n,), slopes by each parameter (n,) and their information.
 
-        None means the square of the slope.
+        None means the squares of the slopes.
         """
         ...
 
@@ -90,9 +99,9 @@ class Errors(Protocol):
 class Mixture:
     """Direct, reflected or an outlier (`calib.range_errors.densities`): the likelihood of ranges.
 
-    With `expected` the information of a residual is its expectation by the model (Fisher's information), not the square
-    of its slope: if few ranges determine an unknown, such as a place on a path, their squares scatter too much. With
-    `restricted` noise is estimated by a restricted likelihood (`RangeRows.with_uncertainty`).
+    With `expected` the information is its expectation by the model (Fisher's information), not the squares of slopes:
+    if few ranges determine an unknown, such as a place on a path, their squares scatter too much. With `restricted`
+    noise is estimated by a restricted likelihood (`RangeRows.with_uncertainty`).
     """
 
     expected: bool = False
@@ -100,33 +109,39 @@ class Mixture:
     dispersion: float = 1.0
     parameters: tuple[str, ...] = OF_ERRORS
 
-    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
-        """Return log densities (n,) and slopes by each parameter (n,)."""
+    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], RangeInformation | None]:
+        """Return log densities (n,), slopes by each parameter (n,) and their information."""
         found = error_slopes(values[RESIDUAL], values)
         if not self.expected:
             return found.log_density, found.by, None
         typical = {name: np.atleast_1d(np.median(values[name])) for name in self.parameters}
-        alone, shared = self._expected(typical)
-        sharper = np.exp(typical["noise"] - values["noise"])
-        direct = (1 + np.exp(typical["odds"])) / (1 + np.exp(values["odds"]))
-        by = sum(part * found.by[name] for part, name in zip(shared, self.parameters, strict=True)) * sharper
-        information = np.broadcast_to(alone * sharper**2 * direct, found.log_density.shape)
-        return found.log_density, found.by | {SHARED: by}, information
+        alone, factor = self._expected(typical)
+        noise, odds, mean = np.exp(typical["noise"] - values["noise"]), expit(values["odds"]), expit(typical["odds"])
+        # Information is proportional to the share of the ranges that have it: direct ones, or reflected ones.
+        direct, reflected = np.sqrt((1 - odds) / (1 - mean)), np.sqrt(odds / mean)
+        sizes = dict.fromkeys(self.parameters, reflected)
+        sizes |= {"noise": direct, "odds": direct * reflected, "outliers": np.ones(1), RESIDUAL: noise}
+        rows = (zip(sizes.items(), row, strict=True) for row in factor)
+        directions = tuple({name: size * own for (name, size), own in row} for row in rows)
+        information = np.broadcast_to(alone * (noise * direct) ** 2, found.log_density.shape)
+        return found.log_density, found.by, RangeInformation(residual=information, directions=directions)
 
     def _expected(self, typical: dict[str, Floats]) -> tuple[float, Floats]:
-        """Return the information of a residual if the other parameters are fitted, 1/m^2, and the regression of its
-        slope on theirs (k,).
+        """Return the information of a residual if the other parameters are fitted, 1/m^2, and directions (k, k + 1)
+        whose outer squares are the information of the others, and of the residual by its regression on these.
         """
         sigma = float(np.exp(typical["noise"][0]))
         longest = 8 * sigma + 30 * float(np.exp(typical["detour"][0]))
-        residual = np.concatenate([np.linspace(-8 * sigma, 8 * sigma, 321), np.geomspace(8.1 * sigma, longest, 120)])
+        beyond = np.geomspace(8.1 * sigma, longest, 120)
+        residual = np.concatenate([-beyond[::-1], np.linspace(-8 * sigma, 8 * sigma, 321), beyond])
         found = error_slopes(residual, typical)
         weight = np.exp(found.log_density) * np.gradient(residual)
         weight /= weight.sum()
         slope, others = found.by[RESIDUAL], np.array([found.by[name] for name in self.parameters])
-        square, across = (others * weight) @ others.T, (others * weight) @ slope
-        shared = np.linalg.lstsq(square + 1e-9 * np.eye(len(square)), across, rcond=1e-8)[0]
-        return float(weight @ slope**2 - shared @ across), shared
+        square, across = (others * weight) @ others.T + 1e-9 * np.eye(len(others)), (others * weight) @ slope
+        shared = np.linalg.lstsq(square, across, rcond=1e-8)[0]
+        root = np.linalg.cholesky(square).T
+        return float(weight @ slope**2 - shared @ across), np.column_stack([root, root @ shared])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,13 +165,13 @@ class Robust:
         square = float(np.mean((weight * residual / self.scale_m) ** 2))
         return replace(self, dispersion=effect * max(square / max(float(np.mean(slope)), 1e-3), 1e-9))
 
-    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
-        """Return minus the loss (n,), its slope by the residual (n,) and the information of each residual (n,)."""
+    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], RangeInformation]:
+        """Return minus the loss (n,), its slope by the residual (n,) and their information."""
         u = values[RESIDUAL] / self.scale_m
         weight, slope = self.weights(u)
         information = (slope if self.least is None else np.maximum(slope, self.least * weight)) / self.scale_m**2
         by, value = -weight * u / self.scale_m, -_loss(self.weights)(np.abs(u))
-        return value, {RESIDUAL: by}, information
+        return value, {RESIDUAL: by}, RangeInformation(residual=information)
 
 
 @cache
@@ -283,7 +298,6 @@ class RangeRows:
                 log_density, by = log_density - 0.5 * over, by | {"noise": by["noise"] + over}
             share = 1 / self.errors.dispersion
             by = {name: share * slope for name, slope in by.items()} if share != 1 else by
-            information = None if information is None else share * information
             yield self._as_terms(blocks, rows, share * float(np.sum(log_density)), by, information, moved)
 
     def residuals(self, x: Floats) -> Floats:
@@ -342,11 +356,15 @@ class RangeRows:
         return found
 
     def _as_terms(
-        self, blocks: slice, rows: slice, value: float, by: dict[str, Floats], information: Floats | None, moved: Any
+        self,
+        blocks: slice,
+        rows: slice,
+        value: float,
+        by: dict[str, Floats],
+        information: RangeInformation | None,
+        moved: Any,
     ) -> Terms:
-        """Return the terms of rows, with information by squares of slopes, or by the information of each residual and
-        squares of the other slopes.
-        """
+        """Return the terms of rows, with the given information, or by squares of slopes."""
         count, several = rows.stop - rows.start, blocks.stop - blocks.start
         starts = self.starts[blocks.start : blocks.stop + 1] - rows.start
         columns, entries, names = [], list[Floats](), list[str]()
@@ -364,18 +382,22 @@ class RangeRows:
             entries.append(-moved.T)
             names.append(RESIDUAL)
         stacked = np.concatenate(columns, axis=1)
-        slopes = np.concatenate([by[name] * one for name, one in zip(names, entries, strict=True)])
-        score, weight = by[RESIDUAL], self.errors.dispersion
-        squares = [Squares(columns=stacked, entries=slopes, residual=score, weight=weight)]
+
+        def square(beside: dict[str, Floats], weight: float) -> Squares:
+            slopes = np.concatenate([beside[name] * one for name, one in zip(names, entries, strict=True)])
+            return Squares(columns=stacked, entries=slopes, residual=beside[RESIDUAL], weight=weight)
+
+        of_slopes = square(by, self.errors.dispersion)
+        squares = [of_slopes]
         if information is not None:
             chosen = [k for k, name in enumerate(names) if name == RESIDUAL]
             by_residual = np.concatenate([columns[k] for k in chosen], axis=1)
-            of_residual = np.concatenate([entries[k] for k in chosen])
-            squares = [Squares(columns=by_residual, entries=of_residual, residual=np.ones(count), weight=information)]
-            if len(chosen) < len(names):
-                beside = by | {RESIDUAL: by[SHARED]}
-                shared = np.concatenate([beside[name] * one for name, one in zip(names, entries, strict=True)])
-                squares = [Squares(columns=stacked, entries=shared, residual=by[SHARED], weight=weight), *squares]
+            of_residual, share = np.concatenate([entries[k] for k in chosen]), 1 / self.errors.dispersion
+            alone, ones = share * information.residual, np.ones(count)
+            directions = information.directions if len(chosen) < len(names) else ()
+            squares = [square(one, share) for one in directions]
+            squares.append(Squares(columns=by_residual, entries=of_residual, residual=ones, weight=alone))
+        slopes, score = of_slopes.entries, of_slopes.residual
         return Terms(value=value, slopes=slopes, score=score, columns=stacked, starts=starts, squares=squares)
 
 

@@ -189,8 +189,12 @@ class Priors:
             found[where] -= weight * pulled
         return found
 
-    def update(self, x: Floats, covariance: Inverse) -> None:
-        """Estimate the weights with bounds from unknowns (p,) and their covariance (p, p)."""
+    def update(self, x: Floats, covariance: Inverse) -> float:
+        """Estimate the weights with bounds from unknowns (p,) and their covariance (p, p).
+
+        Returns the expected gain of the log likelihood of the weights, integrated over the unknowns.
+        """
+        gain = 0.0
         for k, (where, prior) in enumerate(self.all):
             if prior.bounds is None:
                 continue
@@ -201,9 +205,12 @@ class Priors:
                 total = partial(_log_sum_of_scaled, square, logarithm)
                 self.powers[k] = minimize_scalar(total, bounds=(0, 1), method="bounded").x
                 self.scale_by_units(x)
-            left = self.ranks[k] - self.weights[k] * trace_of_product(covariance, self.structures[k], where)
+            weight = self.weights[k]
+            left = self.ranks[k] - weight * trace_of_product(covariance, self.structures[k], where)
             size = max(float(away @ (self.structures[k] @ away)), 1e-300)
             self.weights[k] = float(np.clip(max(left, 1e-2) / size, *prior.bounds))
+            gain += 0.5 * (left - weight * size) * math.log(self.weights[k] / weight)
+        return gain
 
     def deviation(self, kind: str) -> float:
         """Return the present standard deviation of the last prior of a kind."""

@@ -19,9 +19,9 @@ from threadpoolctl import threadpool_limits
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.inverse import inverse_of
-from calib.estimator.optimize import EVIDENCE_STEPS
+from calib.estimator.optimize import MOST_STEPS, SETTLED
 from calib.estimator.range_model import RangeModel
-from calib.estimator.range_rows import RESIDUAL
+from calib.estimator.range_rows import RESIDUAL, RangeInformation
 from calib.estimator.rows import sum_rows
 from calib.estimator.unknowns import Priors
 from calib.evaluation.filters import IMUS
@@ -54,10 +54,10 @@ class ExpectedErrors:
     parameters: tuple[str, ...] = ()
     dispersion: float = 1.0
 
-    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats]:
-        """Return log densities and slopes of zero, and the information of each residual (n,)."""
+    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], RangeInformation]:
+        """Return log densities and slopes of zero, and the information of each residual."""
         zero = np.zeros_like(values[RESIDUAL])
-        return zero, {RESIDUAL: zero}, zero + self.informed()
+        return zero, {RESIDUAL: zero}, RangeInformation(residual=zero + self.informed())
 
     def informed(self) -> float:
         """Return the information of a range on its distance, 1/m^2: the mean squared slope of the log likelihood."""
@@ -164,10 +164,11 @@ class Information:
         of_ranges = sum_rows([ranges, *model.gauge_rows(self.layout)], self.x).information
         beside = sum_rows(list(known_rows(self.motion, self.layout).values()), self.x).information
         priors, self.delays = Priors(self.layout), self.layout.indices(["delay"])
-        for _ in range(EVIDENCE_STEPS):
+        for _ in range(MOST_STEPS):
             known = of_ranges + beside + priors.precision()
             self.covariance = inverse_of(known, self.layout.free())
-            priors.update(self.x, self.covariance)
+            if priors.update(self.x, self.covariance) < SETTLED:
+                break
         with_truth = with_known_distances(of_ranges + priors.precision(), self.layout, self.delays)
         self.covariance_ns2 = self.covariance[:, self.delays][self.delays] * variance_factor(scene)
         self.verdict = verdict_on(self.covariance_ns2, with_truth, self.tags)

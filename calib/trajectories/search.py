@@ -246,7 +246,7 @@ class Search:
         """
         time, pair = self.motion.scene.time_s, self.model.pairs.number
         _, by, known = self.rows.errors.slopes(self.rows.values(self.x))
-        slope, information = by[RESIDUAL], float(np.mean(by[RESIDUAL] ** 2 if known is None else known))
+        slope, information = by[RESIDUAL], float(np.mean(by[RESIDUAL] ** 2 if known is None else known.residual))
         first, second, *_ = self.geometry.antennas(self.x)
         away = (second - first) / np.maximum(np.linalg.norm(second - first, axis=1), 1e-6)[:, None]
         found = [np.zeros((3, 0))]

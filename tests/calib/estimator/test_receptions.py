@@ -164,14 +164,21 @@ def test_receptions_that_cannot_be_fitted_are_refused(change, settings, error, s
 def test_a_real_flight_has_narrower_intervals_and_the_same_delays(tmp_path):
     flown = read_source(miluv(tmp_path), importer="miluv")
     (delays, std), (heard, narrow) = (fitted(flown, use) for use in ("exchanges", "receptions"))
-    # 317 ranges, and about 700 differences of arrival at the five other tags.
-    assert (narrow < 0.85 * std).all()
+    # A check widens the interval of a tag that it names.
+    found = calib.fit(flown, use="receptions")
+    named = [tag for tag in found.calibration.delays_ns if any(w.startswith(f"tag {tag}:") for w in found.warnings)]
+    assert len(named) < 2
+    others = ~np.isin(sorted(found.calibration.delays_ns), named)
+    delays, std, heard, narrow = (one[others] for one in (delays, std, heard, narrow))
+    # 317 ranges, and about 700 differences of arrival at the five other tags; by theory the mean ratio is 0.76.
+    assert (narrow < std).all()
+    assert narrow.mean() < 0.8 * std.mean()
     # The information of the receptions is independent, so the change has the difference of both variances (Hausman
     # 1978).
     assert np.abs((heard - delays) / np.sqrt(std**2 - narrow**2)).max() < 3
     # The doctor names the contradiction: two tags of one robot, a lever arm apart, receive each other's frames too
     # early.
-    said = [w for w in calib.fit(flown, use="receptions").warnings if "overheard" in w]
+    said = [w for w in found.warnings if "overheard" in w]
     assert all(w.startswith(("path 10-11", "path 20-21", "path 30-31")) for w in said), said
 
 

@@ -9,7 +9,7 @@ from scipy import optimize, sparse
 import calib
 from benchmarks.worlds import FIRST_REPORTED, Recipe, make
 from calib.estimator import rows, unknowns
-from calib.estimator.grouped_errors import fit_grouped_errors, scattered
+from calib.estimator.grouped_errors import error_unknowns, fit_grouped_errors, scattered
 from calib.estimator.inverse import SparseInverse, inverse_of, trace_of_product
 from calib.estimator.known_distances import fit_known_distances
 from calib.estimator.optimize import maximize
@@ -170,6 +170,27 @@ def test_noise_is_that_of_restricted_likelihood_however_many_offsets_there_are(s
     assert np.exp(best) == pytest.approx(0.05, rel=0.08)
     # The joint likelihood gives a smaller value, by up to a tenth.
     assert maximize([rows], unknowns.Priors(layout), layout.start(), evidence_steps=0).of("noise")[0] < best - 0.03
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.5])
+def test_few_ranges_determine_how_much_the_noise_of_groups_differs(spread):
+    """300 groups of four normal errors, whose logarithms of noise have this standard deviation."""
+    rng = np.random.default_rng(6)
+    noise = 0.05 * np.exp(spread * rng.normal(size=(300, 1)))
+    group, names = np.repeat(np.arange(300), 4), ("",) * 300
+    blocks, parts = error_unknowns(0.05, names, group)
+    prior = unknowns.Prior.of_deviation(1e-3)
+    blocks.append(unknowns.Unknown(kind="offset", names=names, start=np.zeros(300), priors=(prior,)))
+    parts.append(Part(parameter=RESIDUAL, kind="offset", columns=group[:, None], values=np.full((1200, 1), -1.0)))
+    layout = unknowns.Layout(tuple(blocks))
+    error = (noise * rng.normal(size=(300, 4))).ravel()
+    priors = unknowns.Priors(layout)
+    maximize([RangeRows.of(error, group, parts, Mixture(restricted=True), layout)], priors, layout.start())
+    # Logarithms of the noise of four draws scatter by 0.35, so 300 groups determine a spread of 0.5 to 0.03, and limit
+    # one of 0 to 0.1: twice this. With squares of slopes instead of expected information it is 0.58.
+    assert priors.deviation("noise of pair") == pytest.approx(spread, abs=0.06 if spread else 0.14)
+    # No range is reflected: the first value stays or falls; with squares of slopes it rises to its bound of 2.
+    assert priors.deviation("odds of pair") < 0.75
 
 
 def test_noise_accounts_for_other_unknowns():
