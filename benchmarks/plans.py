@@ -101,8 +101,8 @@ def row(name: str, fits: list[Fitted], plans: tuple[calib.FlightPlan, calib.Flig
         f"{1e3 * plan.common_ns / TWO_SIDED:.0f}, {1e3 * like.common_ns / TWO_SIDED:.0f}",
         f"{np.sqrt(np.mean(common**2)):.0f}" if alike else "",
     ]
-    # Undetermined delays have no predicted error.
-    cells[3:] = [f"({cell})" if cell and not says else cell for cell in cells[3:]]
+    # Undetermined delays have no predicted error, and arbitrary ones in fits.
+    cells[3:] = [cell if says else "" for cell in cells[3:]]
     return f"| {' | '.join(cells)} |"
 
 
