@@ -201,11 +201,13 @@ class World:
     def antennas(self, tags: Ints, time_s: Floats) -> tuple[Floats, Floats]:
         """Return positions (n, 3) and rotations (n, 3, 3) of the antennas of tags (n,) at true times (n,)."""
         position, rotation = np.empty((len(tags), 3)), np.empty((len(tags), 3, 3))
-        for place in np.unique(tags).tolist():
-            tag, rows = self.scenario.tags[place], np.flatnonzero(tags == place)
-            at, rotation[rows] = self.trajectories[tag.body].pose(time_s[rows])
-            position[rows] = at + rotation[rows] @ np.array(tag.lever_arm_m)
-        return position, rotation
+        names = sorted(self.trajectories)
+        body = np.array([names.index(tag.body) for tag in self.scenario.tags])[tags]
+        for number in np.unique(body).tolist():
+            rows = np.flatnonzero(body == number)
+            position[rows], rotation[rows] = self.trajectories[names[number]].pose(time_s[rows])
+        arms_m = np.array([tag.lever_arm_m for tag in self.scenario.tags])[tags]
+        return position + (rotation @ arms_m[:, :, None])[:, :, 0], rotation
 
     def motion_capture(self) -> Poses:
         """Return the poses that motion capture records during the run, with its rate, noise, latency and gaps."""
