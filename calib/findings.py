@@ -101,7 +101,8 @@ REMEDIES: Final = {
     "positions of listeners": "check the positions of the listeners, or fit with `use` exchanges",
     "positions of a target and a listener": "check the positions of both tags",
     "unused differences of arrival": "fit with `use` receptions",
-    "scale of true distances": "check scale, unit and lever arms of the true distances",
+    "scale of true distances": "check scale, unit and lever arms of the true distances; weak reflections, which shift "
+    "first paths, can grow with the distance as well",
     "time offset of true distances": "check the clocks (`calib doctor` states the difference)",
     "errors of places": "check the lever arms, then record also at other places, or farther from walls: a common error "
     "of all ranges cannot be detected",
