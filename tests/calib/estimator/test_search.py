@@ -193,6 +193,23 @@ def test_few_ranges_determine_how_much_the_noise_of_groups_differs(spread):
     assert priors.deviation("odds of pair") < 0.75
 
 
+def test_expected_information_is_the_mean_of_squared_slopes_of_drawn_errors():
+    """Three groups of errors with other noise, or another share of reflections."""
+    rng, count = np.random.default_rng(0), 40_000
+    sigma, share = np.repeat([[0.05, 0.05, 0.1], [0.1, 0.3, 0.1]], count, axis=1)
+    reflected = rng.random(3 * count) < share
+    error = rng.normal(0, sigma) + reflected * (0.03 + rng.exponential(0.3, 3 * count))
+    common = {"detour": np.log(0.3), "least": np.log(0.03), "outliers": -30.0, "long": -30.0}
+    values = {RESIDUAL: error, "noise": np.log(sigma), "odds": np.log(share / (1 - share))}
+    values |= {name: np.array([value]) for name, value in common.items()}
+    drawn, known = Mixture().slopes(values)[1], Mixture(expected=True).slopes(values)[2]
+    # The typical information is scaled to other groups, which is right to a sixth; for shares, noise is not in it.
+    for name, tolerance in {"noise": 0.2, "detour": 0.2, "odds": 0.45}.items():
+        squares = (drawn[name] ** 2).reshape(3, count).mean(axis=1)
+        stated = np.sum([np.broadcast_to(one[name], 3 * count) ** 2 for one in known.directions], axis=0)
+        assert stated[::count] == pytest.approx(squares, rel=tolerance)
+
+
 def test_noise_accounts_for_other_unknowns():
     rng = np.random.default_rng(1)
     kinds = VALUES | {"long": -30.0, RESIDUAL: 0.0}
