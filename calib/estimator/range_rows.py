@@ -117,7 +117,9 @@ class Mixture:
         typical = {name: np.atleast_1d(np.median(values[name])) for name in self.parameters}
         alone, factor = self._expected(typical)
         noise, odds, mean = np.exp(typical["noise"] - values["noise"]), expit(values["odds"]), expit(typical["odds"])
-        # Information is proportional to the share of the ranges that have it: direct ones, or reflected ones.
+        # Information is proportional to the share of the ranges that have it: direct ones, or reflected ones. This is
+        # right to a sixth, and to 45 % for shares where noise doubles, or residuals where the share is three times as
+        # large.
         direct, reflected = np.sqrt((1 - odds) / (1 - mean)), np.sqrt(odds / mean)
         sizes = dict.fromkeys(self.parameters, reflected)
         sizes |= {"noise": direct, "odds": direct * reflected, "outliers": np.ones(1), RESIDUAL: noise}
