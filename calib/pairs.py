@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,3 +32,14 @@ def pairs_of(initiator: Ints, target: Ints) -> Pairs:
     low, high = np.minimum(initiator, target).astype(np.int64), np.maximum(initiator, target).astype(np.int64)
     codes, number = np.unique(low << 32 | high, return_inverse=True)
     return Pairs(number.astype(np.int32), np.column_stack([codes >> 32, codes & 0xFFFFFFFF]))
+
+
+def pairs_of_bodies(pairs: Pairs, bodies: Mapping[int, str]) -> Ints | None:
+    """Return the number of the two bodies of each pair (pairs,), by the body of each tag; None if no two pairs have the
+    same bodies.
+
+    A tag without a known body is a body itself.
+    """
+    ends = [frozenset(bodies.get(tag, f"tag {tag}") for tag in both) for both in pairs.ends.tolist()]
+    groups = list(dict.fromkeys(ends))
+    return np.array([groups.index(both) for both in ends]) if len(groups) < len(ends) else None

@@ -19,13 +19,21 @@ from calib.estimator.arrival_rows import OFFSET_OF_PATH, PATH_SIGNS
 from calib.estimator.covariance import of_few_draws
 from calib.estimator.inverse import positive_part
 from calib.estimator.known_distances import RangeFit
-from calib.estimator.range_model import METRES_A_NS, TYPICAL_OFFSET_M, RangeModel, free_ends
+from calib.estimator.range_model import (
+    METRES_A_NS,
+    OFFSET_OF_BODIES,
+    OFFSET_OF_PAIR,
+    TYPICAL_OFFSET_M,
+    RangeModel,
+    free_ends,
+)
 from calib.estimator.range_rows import Mixture
 from calib.estimator.score_tests import Derivative, Family, FoundOffset, Slopes, Tested, search, widening
 from calib.estimator.score_tests import findings as offsets_of
 from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
 from calib.findings import FIT_LEVELS, NAMED_DETOUR_M, SMALLEST_NS, Finding, combined, warning
+from calib.pairs import pairs_of_bodies
 from calib.spread import less_medians
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -59,12 +67,16 @@ def examine_fit(found: RangeFit) -> tuple[Floats, list[Finding]]:
     """
     slopes, louder, alone = found.slopes, change_per_decibel(found), len(found.searches) > 1
     readings = None if alone else errors_of_readings(found.model, louder)
-    tested = slopes.tests(list(families(found, louder, beside_curve=not alone)), readings)
+    group = pairs_of_bodies(found.model.pairs, dict(found.model.ranges.bodies))
+    of_bodies = [] if group is None else list(_of_bodies(found, group))
+    tested = slopes.tests([*of_bodies, *families(found, louder, beside_curve=not alone)], readings)
     if readings is not None:
         # Every recording has noise of powers, and alternatives are tested with it fitted.
         noise = replace(tested[-1], family=replace(tested[-1].family, kind="readings", names=["readings"]))
         noise = noise.combined(np.eye(len(noise.total))[-1:])
         tested = [*(one.with_fitted([-1]).combined(np.eye(len(one.total))[:-1]) for one in tested), noise]
+    # Offsets of bodies are a separate question, with its own share of the false alarms.
+    bodies = [tested.pop(0) for _ in of_bodies]
     if found.slopes_of_heard is not None:
         tested += found.slopes_of_heard.tests(list(_of_heard(found)))
     findings = _without_explained(search(tested, FIT_LEVELS["offsets"]))
@@ -76,9 +88,10 @@ def examine_fit(found: RangeFit) -> tuple[Floats, list[Finding]]:
         if one.family.kind in ("pair", "session") and not len(one.family.fitted):
             plain = plain + widening(one)
     places_ns2, of_places = np.zeros_like(plain), list[Finding]()
-    if not alone and found.model.curve is not None:
+    if group is not None and not alone and found.model.curve is not None and found.model.settings.constants == "tag":
         pairs = next(one for one in tested if one.family.kind == "pair")
-        places_ns2, of_places = place_covariance(found, slopes, pairs, plain)
+        bodies = bodies or [pairs.combined(np.eye(int(group.max()) + 1)[:, group])]
+        places_ns2, of_places = place_covariance(found, slopes, bodies[0], group, plain)
     covariance, named = _covariance_and_findings(plain, findings, places_ns2, of_places)
     # Few pairs determine the size of their offsets poorly. Variance that findings added already is not added again.
     optimum = found.searches[0].optimum
@@ -151,6 +164,13 @@ def _of_heard(found: RangeFit) -> Iterator[Family]:
         yield Family(kind="path", names=arrivals.paths, derivative=path, fitted=fitted)
 
 
+def _of_bodies(found: RangeFit, group: Ints) -> Iterator[Family]:
+    """Yield offsets of all ranges between the same two bodies, if they are fitted; `group` (pairs,) is their number."""
+    if len(fitted := found.searches[0].optimum.layout.indices([OFFSET_OF_BODIES])):
+        derivative = Derivative(group[found.model.pairs.number][:, None], UNIT, len(fitted))
+        yield Family(kind="bodies", names=list(map(str, range(len(fitted)))), derivative=derivative, fitted=fitted)
+
+
 def of_pairs(found: RangeFit) -> Family:
     """Return the alternatives: an offset of each pair."""
     pairs = found.model.pairs
@@ -158,7 +178,7 @@ def of_pairs(found: RangeFit) -> Family:
         kind="pair",
         names=[f"pair {a}-{b}" for a, b in pairs.ends.tolist()],
         derivative=Derivative(pairs.number[:, None], UNIT, len(pairs.ends)),
-        fitted=found.searches[0].optimum.layout.indices(["offset of pair"]),
+        fitted=found.searches[0].optimum.layout.indices([OFFSET_OF_PAIR]),
     )
 
 
@@ -459,7 +479,7 @@ def _persistence(found: RangeFit) -> Iterator[Finding]:
 
 def _redundancy(model: RangeModel) -> Iterator[Finding]:
     """Yield a finding if there are so few pairs that offsets of pairs cannot be separated from delays."""
-    count, fitted = len(model.pairs.ends), any(unknown.kind == "offset of pair" for unknown in model.unknowns)
+    count, fitted = len(model.pairs.ends), any(unknown.kind == OFFSET_OF_PAIR for unknown in model.unknowns)
     if model.settings.constants == "tag" and count > 2 and not fitted:
         slopes = 0.5 * METRES_A_NS * free_ends(model.pairs, model.tags, model.settings)
         moved_ns = TYPICAL_OFFSET_M * float(np.linalg.norm(np.linalg.pinv(slopes), axis=1).max())

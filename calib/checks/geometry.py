@@ -417,7 +417,7 @@ def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
         # If anchors are metres off, the effect of power is unknown, and small in comparison.
         far = robust_spread(fit.residual[mine]) > ASTRAY_M
         # One of twenty right places is searched, which costs time only; the slopes at the other place are tested.
-        if far or _p_of_place(own, own.total) <= 0.05:
+        if far or own.joint_p_value(own.total) <= 0.05:
             error_m = (fit.error if far else fit.residual)[mine]
             starts = [place - places[body] for place in places.values()]
             away[body] = _place(sides[body][mine], error_m, fit.model.pairs.number[mine], starts)
@@ -451,7 +451,7 @@ def _displaced(view: RecordingView, fit: QuickFit) -> Iterator[Candidate]:
             f"instead of {100 * before:.1f} cm"
             + (f"; they hardly separate {loose} from delays" if loose else "")
             + (f"; {others} is given at that position: check whether the ids are exchanged" if others else ""),
-            min(1.0, _p_of_place(own, own.information @ shift * (1 - TOLERANCE_M / size)) * len(sides)),
+            min(1.0, own.joint_p_value(own.information @ shift * (1 - TOLERANCE_M / size)) * len(sides)),
             {
                 "body": body,
                 "away_m": shift,
@@ -505,14 +505,6 @@ def _after_offsets_of_pairs(tested: Tested, pairs: int) -> Tested:
     return replace(found, information=left[:, pairs:], covariance=found.covariance + offsets @ offsets.T)
 
 
-def _p_of_place(tested: Tested, slope: Floats) -> float:
-    """Return the p-value of slopes (k,) by places, whose mean is zero if the places are right (Hotelling)."""
-    solved, _, rank, _ = np.linalg.lstsq(tested.covariance, slope, rcond=1e-12)
-    count = max(int(rank), 1)
-    freedom = max(min(tested.lasting.freedom, tested.blocks) - count, 1.0)
-    return float(special.fdtrc(count, freedom, float(slope @ solved) / count))
-
-
 def beside_places(view: RecordingView, fit: QuickFit, pairs: Sequence[int]) -> tuple[Tested, list[Candidate]]:
     """Return the slopes by offsets of all pairs with places of anchors fitted, and by these places with offsets of
     `pairs` fitted.
@@ -529,7 +521,7 @@ def beside_places(view: RecordingView, fit: QuickFit, pairs: Sequence[int]) -> t
     together = _after_offsets_of_pairs(tested.with_fitted(pairs), count)
     each, away, lines = _by_body(together, sides), list[str](), list[str]()
     # The anchors that are displaced for any positions of the others, or otherwise all.
-    alone = [body for body, own in each.items() if _p_of_place(own, own.total) < BUDGET] or [*sides]
+    alone = [body for body, own in each.items() if own.joint_p_value(own.total) < BUDGET] or [*sides]
     for body in alone:
         shift = -_step(each[body])
         away.append(f"{body} {_axes(each[body], shift)[0]}")
@@ -537,7 +529,7 @@ def beside_places(view: RecordingView, fit: QuickFit, pairs: Sequence[int]) -> t
     seen = Candidate(
         "places that do not close",
         f"ranges contradict the positions of {', '.join(sides)} together; the best displacements are {'; '.join(away)}",
-        _p_of_place(together, together.total),
+        together.joint_p_value(together.total),
         {"lines": "".join(lines)},
     )
     return offsets, [seen]

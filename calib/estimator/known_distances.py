@@ -20,7 +20,7 @@ from calib.estimator.covariance import Kept, sandwich
 from calib.estimator.covariates import COMMON, OWN, OWN_WARMTH, WARMTH
 from calib.estimator.losses import LOSSES, MIXTURE
 from calib.estimator.optimize import Optimum, maximize
-from calib.estimator.range_model import METRES_A_NS, RangeModel
+from calib.estimator.range_model import METRES_A_NS, OFFSET_KINDS, OFFSET_OF_PAIR, RangeModel
 from calib.estimator.range_rows import RESIDUAL, Mixture, RangeRows, Robust, block_of
 from calib.estimator.rows import NormalRows, Rows
 from calib.estimator.score_tests import Slopes
@@ -165,7 +165,9 @@ def fit_known_distances(ranges: Ranges, settings: FitSettings) -> RangeFit:
     return with_covariances(model, fitted, blocks)
 
 
-def model_of(ranges: Ranges, settings: FitSettings, *, offsets: bool = True, trimmed: bool = True) -> RangeModel:
+def model_of(
+    ranges: Ranges, settings: FitSettings, *, offsets: Sequence[str] = OFFSET_KINDS, trimmed: bool = True
+) -> RangeModel:
     """Return the model of ranges in order of time.
 
     Raises `UnanswerableError` if there are too few ranges, and what `RangeModel.of` raises.
@@ -314,7 +316,7 @@ def with_covariances(model: RangeModel, fitted: Fitted, blocks: TimeBlocks) -> R
     slopes, *of_heard = fitted.slopes(blocks)
     found = sandwich(slopes, kept, fitted.beside)
     covariances = {name: matrix for name, (matrix, _) in found.items()}
-    if "offset of pair" in layout.where and "odds of pair" in layout.where:
+    if OFFSET_OF_PAIR in layout.where and "odds of pair" in layout.where:
         covariances["delay"] = covariances["delay"] + _covariance_of_other_detours(fitted.optimum)
     return RangeFit(
         model=model,
@@ -348,7 +350,7 @@ def _covariance_of_other_detours(optimum: Optimum) -> Floats:
     noise = np.exp(optimum.of("noise level") + optimum.of("noise of pair"))
     share = expit(optimum.of("odds level") + optimum.of("odds of pair"))
     unit = np.zeros((optimum.layout.size, len(share)))
-    unit[optimum.layout.where["offset of pair"]] = np.eye(len(share))
+    unit[optimum.layout.where[OFFSET_OF_PAIR]] = np.eye(len(share))
     moved = (optimum.covariance @ np.asarray(optimum.information @ unit))[optimum.layout.where["delay"]]
     return np.asarray((moved * (SHAPE * share * noise) ** 2) @ moved.T)
 

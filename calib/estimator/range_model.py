@@ -23,7 +23,7 @@ from calib.estimator.identifiability import free_directions
 from calib.estimator.range_rows import Errors, Mixture, Part, RangeRows, block_of
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown
-from calib.pairs import Pairs
+from calib.pairs import Pairs, pairs_of_bodies
 from calib.settings import FitSettings
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
@@ -53,6 +53,10 @@ change nothing (the study of `make accuracy`)."""
 
 MIN_RANGES_OF_GROUP = 20
 """Minimum number of ranges for the curve of a group."""
+
+
+OFFSET_OF_BODIES, OFFSET_OF_PAIR = OFFSET_KINDS = "offset of bodies", "offset of pair"
+"""Kinds of unknowns: other constants in all ranges between two bodies, and in the ranges of a pair of tags."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,8 +113,10 @@ class RangeModel:
     covariates: Mapping[str, Covariate] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, ranges: Ranges, settings: FitSettings, *, offsets: bool = True, trimmed: bool = True) -> RangeModel:
-        """Return the model of ranges, with `offsets` of pairs and sessions.
+    def of(
+        cls, ranges: Ranges, settings: FitSettings, *, offsets: Sequence[str] = OFFSET_KINDS, trimmed: bool = True
+    ) -> RangeModel:
+        """Return the model of ranges, with some kinds of `offsets`, and with any of these also those of sessions.
 
         With `trimmed`, ranges at the outer half per cent of powers at either end are left out, because they do not
         determine the curve there. Raises `BadInputError` for tags and groups that are not in the ranges.
@@ -143,7 +149,7 @@ class RangeModel:
         if powered.all() and varied:
             noise = SplineValues.at(lifted, knots_for(ordered, SIGMA_SEGMENTS, (low, high)))
         if offsets:
-            blocks += _offsets(ranges, pairs, tags, freedom=_offsets_determined(pairs, tags, settings, carriers))
+            blocks += _offsets(ranges, pairs, tags, settings, carriers, offsets)
         covariates = {}
         for name, (read, kinds) in COVARIATES.items():
             if (asked := getattr(settings, name)) in kinds:
@@ -317,12 +323,31 @@ OFFSETS = (0.01, 1e-4, 1.0)
 """Standard deviation of other constants in the ranges of a pair, such as a wall: start and bounds, m."""
 
 
-def _offsets(ranges: Ranges, pairs: Pairs, tags: list[int], *, freedom: int) -> Iterator[tuple[Unknown, Part]]:
-    """Yield offsets of pairs, if ranges determine some, and of pairs and tags in each of several sessions."""
+def _offsets(
+    ranges: Ranges,
+    pairs: Pairs,
+    tags: list[int],
+    settings: FitSettings,
+    carriers: Sequence[Floats | None],
+    kinds: Sequence[str],
+) -> Iterator[tuple[Unknown, Part]]:
+    """Yield offsets of some kinds, if ranges determine some in addition to delays and constants of curves, and offsets
+    of pairs and tags in each of several sessions."""
     number, count = pairs.number[:, None], len(ranges.sessions)
-    if freedom > 0:
+    known = np.eye(len(pairs.ends)) if settings.constants == "pair" else free_ends(pairs, tags, settings)
+    determined = _rank(known) + sum(one is None for one in carriers)
+    # What is between two bodies lengthens the ranges of all their pairs.
+    group = pairs_of_bodies(pairs, dict(ranges.bodies)) if OFFSET_OF_BODIES in kinds else None
+    if group is not None:
+        rank = _rank(np.hstack([known, np.eye(int(group.max()) + 1)[group]]))
+        if rank > determined:
+            determined = rank
+            # `calib.checks.places` states what a spread of few offsets of bodies adds to intervals.
+            names = tuple(map(str, range(int(group.max()) + 1)))
+            yield block_of(scattered(OFFSET_OF_BODIES, names, OFFSETS), group[number])
+    if OFFSET_OF_PAIR in kinds and (freedom := len(pairs.ends) - determined) > 0:
         # An obstacle makes the ranges of a pair noisy, and changes their mean.
-        block = scattered("offset of pair", pairs.names, OFFSETS, freedom, unit="noise of pair")
+        block = scattered(OFFSET_OF_PAIR, pairs.names, OFFSETS, freedom, unit="noise of pair")
         yield block_of(block, number)
     if count < 2:
         return
@@ -335,16 +360,15 @@ def _offsets(ranges: Ranges, pairs: Pairs, tags: list[int], *, freedom: int) -> 
         yield block_of(scattered(kind, names, OFFSETS), own)
 
 
+def _rank(columns: Floats) -> int:
+    """Return the rank of a matrix (pairs, k) of zeros and ones."""
+    return int(np.linalg.matrix_rank(columns.T @ columns, hermitian=True))
+
+
 def free_ends(pairs: Pairs, tags: list[int], settings: FitSettings) -> Floats:
     """Return which tags (tags,) with unknown delays are in each pair, as 0 and 1 (pairs, tags)."""
     free = np.array([tag not in settings.fixed_ns for tag in tags])
     return np.asarray((pairs.ends[:, :, None] == np.array(tags)).sum(axis=1) * free, dtype=np.float64)
-
-
-def _offsets_determined(pairs: Pairs, tags: list[int], settings: FitSettings, carriers: Sequence[Floats | None]) -> int:
-    """Return the number of offsets of pairs that ranges determine in addition to delays and constants of curves."""
-    taken = len(pairs.ends) if settings.constants == "pair" else np.linalg.matrix_rank(free_ends(pairs, tags, settings))
-    return int(len(pairs.ends) - taken - sum(one is None for one in carriers))
 
 
 def _carrier(pairs: Pairs, tags: list[int], settings: FitSettings, group: tuple[int, ...] | None) -> Floats | None:

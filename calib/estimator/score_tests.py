@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import sparse
+from scipy import sparse, special
 
 from calib.estimator.optimize import Optimum
 from calib.estimator.range_rows import RangeRows
@@ -139,6 +139,13 @@ class Tested:
         own = self.information[np.ix_(which, which)]
         step[:, which] -= self.information[:, which] @ np.linalg.pinv(own, rcond=1e-9, hermitian=True)
         return self.combined(step)
+
+    def joint_p_value(self, slope: Floats) -> float:
+        """Return the p-value of slopes (k,) whose mean is zero if there are no offsets (Hotelling)."""
+        solved, _, rank, _ = np.linalg.lstsq(self.covariance, slope, rcond=1e-12)
+        count = max(int(rank), 1)
+        freedom = max(min(self.lasting.freedom, self.blocks) - count, 1.0)
+        return float(special.fdtrc(count, freedom, float(slope @ solved) / count))
 
 
 class Slopes:

@@ -22,7 +22,14 @@ from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, basis, 
 from calib.estimator.covariates import COMMON, OF_PLACES, OWN, OWN_WARMTH, WARMTH
 from calib.estimator.grouped_errors import ReflectionFeatures
 from calib.estimator.known_distances import LARGEST_SPREAD_M, DescribedErrors, RangeFit, described_errors
-from calib.estimator.range_model import METRES_A_NS, OFFSETS, TYPICAL_OFFSET_M, RangeModel
+from calib.estimator.range_model import (
+    METRES_A_NS,
+    OFFSET_OF_BODIES,
+    OFFSET_OF_PAIR,
+    OFFSETS,
+    TYPICAL_OFFSET_M,
+    RangeModel,
+)
 from calib.estimator.range_rows import RESIDUAL
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
 from calib.range_errors.densities import LONG_FACTOR, LongDetours
@@ -302,7 +309,8 @@ def between_recordings(found: RangeFit, errors: DescribedErrors) -> float:
     # The common part of all spells is the offset of the pair.
     slope -= known * slope.sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1e-300)
     spells_m = math.sqrt(mean_variance(known.ravel(), slope.ravel(), TYPICAL_OFFSET_M, OFFSETS[1:]))
-    kinds = [kind for kind in ("offset of pair", "offset of pair in session") if kind in optimum.layout.where]
+    every = (OFFSET_OF_BODIES, OFFSET_OF_PAIR, "offset of pair in session")
+    kinds = [kind for kind in every if kind in optimum.layout.where]
     between_m = math.hypot(spells_m, *(map(optimum.priors.deviation, kinds) if kinds else [spells_m]))
     return between_m if np.ptp(found.model.ranges.session) else max(between_m, BETWEEN_M)
 

@@ -114,7 +114,7 @@ def flight_of(
     """
     truth = scene_from(data, FlightSettings(attitudes="poses", heading_std_deg=0.0), need_power=curve)
     scene = scene_from(data, settings, need_power=curve)
-    model, scene = range_model(scene, FitSettings(), curve=curve, offsets=False)
+    model, scene = range_model(scene, FitSettings(), curve=curve, offsets=())
     for number, name in enumerate(truth.moving):
         if np.count_nonzero(truth.places.body == number) < 2:
             raise UnanswerableError(f"{truth.source}: no positions of body {name}, which a plan needs for its motion")

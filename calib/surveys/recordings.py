@@ -287,7 +287,7 @@ def _locations(ranges: Ranges, groups: Pairs) -> tuple[Floats, Floats, Floats, E
     """
     group, count = groups.number, np.bincount(groups.number)
     median = medians(ranges.raw_m, group)
-    model = RangeModel.of(ranges, FitSettings(delays_only=True), offsets=False)
+    model = RangeModel.of(ranges, FitSettings(delays_only=True), offsets=())
     model = replace(model, noise=None, pairs=groups)
     residual = ranges.raw_m - median[group]
     errors, unknowns, parts = model.error_model(residual)

@@ -21,7 +21,13 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.inverse import Matrix, inverse_of
 from calib.estimator.known_distances import Fitted, RangeFit, model_of, with_covariances
 from calib.estimator.losses import MIXTURE
-from calib.estimator.range_model import BOARD_DELAY_STD_NS, DELAY_NS, METRES_A_NS, RangeModel
+from calib.estimator.range_model import (
+    BOARD_DELAY_STD_NS,
+    DELAY_NS,
+    METRES_A_NS,
+    OFFSET_OF_PAIR,
+    RangeModel,
+)
 from calib.estimator.rows import sum_rows
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
@@ -127,8 +133,13 @@ def _settings(
     return flight, kept, known
 
 
-def range_model(scene: Scene, settings: FitSettings, *, curve: bool, offsets: bool = True) -> tuple[RangeModel, Scene]:
-    """Return the model of delays, curves and offsets, and the scene with the ranges that the model keeps."""
+def range_model(
+    scene: Scene, settings: FitSettings, *, curve: bool, offsets: Sequence[str] = (OFFSET_OF_PAIR,)
+) -> tuple[RangeModel, Scene]:
+    """Return the model of delays, curves and offsets, and the scene with the ranges that the model keeps.
+
+    Trajectories can absorb offsets between bodies; with these as unknowns delays were less certain, and not better.
+    """
     model = model_of(scene.ranges, replace(settings, delays_only=not curve), offsets=offsets)
     return model, replace(scene, ranges=model.ranges)
 
