@@ -70,21 +70,29 @@ def place_covariance(
     # The common part of all delays also depends on the curve, and is far less certain.
     apart = np.eye(len(before_ns2)) - 1 / max(len(before_ns2), 1)
     own, more = (np.diag(apart @ one @ apart) for one in (before_ns2 - included, widening))
-    certain = _of_all(of_residuals) < FIT_LEVELS["places"]
-    p_value = _of_all(p_values)
-    if p_value >= FIT_LEVELS["places"] or not np.any(more > np.maximum(own, SMALLEST_NS**2)):
+    p_value, matters = _of_all(p_values), np.any(more > np.maximum(own, SMALLEST_NS**2))
+    if p_value >= FIT_LEVELS["places"] or not matters:
         return widening - included, []
-    near, directions = "as near walls and objects", "pattern" not in found.model.covariates
-    wrong = f"reflected together, {near}, and trajectories may have followed them"
-    if certain:
-        other = ", or an antenna whose delay depends on the direction" * directions
-        wrong = f"wrong together, {near}, or a wrong lever arm{other}"
-    text = (
-        f"errors depend on places{' or directions' * (certain and directions)}: ranges between the same two bodies "
-        f"are {wrong}, which may change differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals "
-        f"include this"
-    )
+    certain, directions = _of_all(of_residuals) < FIT_LEVELS["places"], "pattern" not in found.model.covariates
+    text = f"{_wrong_ranges(certain, directions)}, which may change differences of delays by "
+    text += f"{1e3 * np.sqrt(more.max()):.0f} ps; intervals include this"
     return widening - included, [warning("errors of places", text, p_value)]
+
+
+def _wrong_ranges(certain: bool, directions: bool) -> str:
+    """Return which errors ranges may have, if residuals show them for `certain`, or only reflections; `directions` may
+    be their cause."""
+    near = "as near walls and objects"
+    if not certain:
+        return (
+            f"errors depend on places: ranges between the same two bodies are reflected together, {near}, and "
+            f"trajectories may have followed them"
+        )
+    antenna = ", or an antenna whose delay depends on the direction" * directions
+    return (
+        f"errors depend on places{' or directions' * directions}: ranges between the same two bodies are wrong "
+        f"together, {near}, or a wrong lever arm{antenna}"
+    )
 
 
 def _of_all(p_values: Sequence[float]) -> float:
