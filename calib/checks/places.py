@@ -16,7 +16,7 @@ import numpy as np
 from scipy import special
 
 from calib.estimator.known_distances import RangeFit
-from calib.estimator.range_model import OFFSET_OF_BODIES
+from calib.estimator.range_model import OFFSET_OF_BODIES, TYPICAL_OFFSET_M
 from calib.estimator.score_tests import REACHED, Slopes, Tested
 from calib.estimator.time_blocks import TimeBlocks
 from calib.findings import BUDGET, FIT_LEVELS, SMALLEST_NS, Finding, warning
@@ -48,8 +48,8 @@ def place_covariance(
     if min(p_values) >= BUDGET:
         return np.zeros_like(before_ns2), []
     if p_stays < BUDGET:
-        # A partition or two that are always in between add 2 cm, within a factor of e.
-        middle, width = 0.02, 1.0
+        # Within a factor of e.
+        middle, width = TYPICAL_OFFSET_M, 1.0
     elif p_varies < BUDGET:
         # The constant part is as large as the varying one, within 0.8 logarithms (a factor of 2.2, a judgement): in
         # rooms of the simulator it was 1.2 to 4 times as large, in smooth fields of errors a sixth to two thirds.

@@ -4,6 +4,7 @@ intervals.
 
 import re
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -36,6 +37,26 @@ def test_offsets_between_bodies_that_last_are_in_the_intervals_and_named():
     inside = [np.mean(np.abs([scores for _, scores in some]) < 1.96) for some in (seeing, blind)]
     assert inside[0] > 0.85
     assert inside[1] < 0.8
+
+
+@pytest.mark.slow
+def test_intervals_include_walls_that_four_and_five_bodies_show_and_hide():
+    """Walls of 3 cm between five bodies move delays by the least squares solution of their offsets."""
+    worlds = [ranges_with_field(seed, bodies=5, seconds=25.0, between_m=0.03) for seed in range(11_200, 11_216)]
+    found = [about_their_mean(calib.fit(ranges).calibration, dict(enumerate(planted, 1))) for ranges, planted in worlds]
+    error, std = np.swapaxes(found, 0, 1)
+    # Ten independent delays have 90 % inside by chance; 80 values have 88 % or less by one chance in a hundred.
+    assert np.mean(np.abs(error / std) < 1.96) > 0.88
+    both = np.array([np.isin(range(5), pair) for pair in combinations(range(5), 2)])
+    moved = (np.eye(5) - 1 / 5) @ np.linalg.pinv(0.5 * 0.2998 * both)
+    known = 0.03 * np.sqrt(np.mean(np.sum(moved**2, axis=1)))
+    # Five contradictions determine the size of offsets, so that the factor of Student's t is 1.3.
+    assert 1.0 < np.median(std) / known < 1.42
+
+
+def test_offsets_between_bodies_may_change_until_another_recording():
+    ranges, _ = ranges_with_field(11_300, bodies=5, seconds=25.0, between_m=0.2)
+    assert 0.1 < calib.fit(ranges).calibration.errors.between_m < 0.4
 
 
 def test_errors_that_come_and_go_are_named_where_bodies_are_as_many_as_their_pairs():
