@@ -89,9 +89,10 @@ def scattered(
     spread: tuple[float, float, float],
     freedom: float = np.inf,
     unit: str | None = None,
+    members: Floats | None = None,
 ) -> Unknown:
     """Return unknowns about zero whose standard deviation is estimated: its first value and bounds are `spread`."""
-    prior = Prior.of_spread(*spread, freedom, unit)
+    prior = replace(Prior.of_spread(*spread, freedom, unit), members=members)
     return Unknown(kind=kind, names=names, start=np.zeros(len(names)), priors=(prior,))
 
 

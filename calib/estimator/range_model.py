@@ -336,17 +336,19 @@ def _offsets(
     number, count = pairs.number[:, None], len(ranges.sessions)
     known = np.eye(len(pairs.ends)) if settings.constants == "pair" else free_ends(pairs, tags, settings)
     determined = _rank(known) + sum(one is None for one in carriers)
-    # What is between two bodies lengthens the ranges of all their pairs.
+    # What is between two bodies lengthens the ranges of all their pairs. Obstacles make ranges noisy, and change means.
     group = pairs_of_bodies(pairs, dict(ranges.bodies)) if OFFSET_OF_BODIES in kinds else None
     if group is not None:
-        rank = _rank(np.hstack([known, np.eye(int(group.max()) + 1)[group]]))
+        owners = np.eye(int(group.max()) + 1)[group]
+        rank = _rank(np.hstack([known, owners]))
         if rank > determined:
-            determined = rank
+            determined, names = rank, tuple(map(str, range(owners.shape[1])))
             # `calib.checks.places` states what a spread of few offsets of bodies adds to intervals.
-            names = tuple(map(str, range(int(group.max()) + 1)))
-            yield block_of(scattered(OFFSET_OF_BODIES, names, OFFSETS), group[number])
+            block = scattered(
+                OFFSET_OF_BODIES, names, OFFSETS, unit="noise of pair", members=(owners / owners.sum(axis=0)).T
+            )
+            yield block_of(block, group[number])
     if OFFSET_OF_PAIR in kinds and (freedom := len(pairs.ends) - determined) > 0:
-        # An obstacle makes the ranges of a pair noisy, and changes their mean.
         block = scattered(OFFSET_OF_PAIR, pairs.names, OFFSETS, freedom, unit="noise of pair")
         yield block_of(block, number)
     if count < 2:

@@ -30,7 +30,8 @@ class Prior:
     `structure` None is the identity; for many unknowns it is sparse, with `rows` independent rows. With `bounds` the
     weight is estimated between them, starting at `weight`, from data with `freedom` degrees of freedom. `unit` is the
     kind of the logarithms (k,) of units: standard deviations are proportional to a power of the units, estimated with
-    the weight between 0 (all are equal) and 1. In layouts without this kind they are equal.
+    the weight between 0 (all are equal) and 1. In layouts without this kind they are equal. With `members` (k, m) a
+    logarithm is the mean of those of m units by these weights.
     """
 
     weight: float
@@ -40,6 +41,7 @@ class Prior:
     rows: int | None = None
     freedom: float = math.inf
     unit: str | None = None
+    members: Floats | None = None
 
     @classmethod
     def of_deviation(cls, deviation: float, centre: Floats | float = 0.0) -> Prior:
@@ -158,6 +160,7 @@ class Priors:
         if prior.unit not in self.layout.where:
             return None
         own = x[self.layout.where[prior.unit]]
+        own = own if prior.members is None else prior.members @ own
         return np.asarray(own - own.mean())
 
     def by_key(self) -> dict[tuple[str, int], float]:
