@@ -41,5 +41,5 @@ def pairs_of_bodies(pairs: Pairs, bodies: Mapping[int, str]) -> Ints | None:
     A tag without a known body is a body itself.
     """
     ends = [frozenset(bodies.get(tag, f"tag {tag}") for tag in both) for both in pairs.ends.tolist()]
-    groups = list(dict.fromkeys(ends))
-    return np.array([groups.index(both) for both in ends]) if len(groups) < len(ends) else None
+    number = {both: k for k, both in enumerate(dict.fromkeys(ends))}
+    return np.array([number[both] for both in ends]) if len(number) < len(ends) else None

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import special
 
+from calib.estimator.covariance import of_prior
 from calib.estimator.known_distances import RangeFit
 from calib.estimator.range_model import OFFSET_OF_BODIES, TYPICAL_OFFSET_M
 from calib.estimator.score_tests import REACHED, Slopes, Tested
@@ -40,7 +41,7 @@ def place_covariance(
     covariance without places. It contains offsets of bodies if these are fitted.
     """
     offsets, variances, p_stays = _not_absorbed(bodies)
-    # Trajectories absorb what varies.
+    # Trajectories absorb errors that vary, which then leave no residuals.
     known = found.searches[0].rows.geometry is None
     variance, p_varies = _varying_part(found, slopes, group) if known else (0.0, 1.0)
     of_residuals = [*([p_stays] if len(offsets) else []), *([p_varies] if known else [])]
@@ -48,7 +49,7 @@ def place_covariance(
     if min(p_values) >= BUDGET:
         return np.zeros_like(before_ns2), []
     if p_stays < BUDGET:
-        # Within a factor of e.
+        # The typical size is right within a factor of e.
         middle, width = TYPICAL_OFFSET_M, 1.0
     elif p_varies < BUDGET:
         # The constant part is as large as the varying one, within 0.8 logarithms (a factor of 2.2, a judgement): in
@@ -60,13 +61,13 @@ def place_covariance(
     spread = SIZES_M[:, None] ** 2 + variances
     likely = -0.5 * np.sum(np.log(spread) + offsets**2 / spread, axis=1)
     size_m = _bound_of_size(likely - 0.5 * (np.log(SIZES_M / middle) / width) ** 2)
-    effects, included_m, optimum = bodies.effects, 0.0, found.searches[0].optimum
-    if len(fitted := optimum.layout.indices([OFFSET_OF_BODIES])):
-        included_m = optimum.priors.deviation(OFFSET_OF_BODIES)
-        size_m = max(size_m, included_m)
-        effects = optimum.covariance[:, fitted][optimum.layout.where["delay"]] / included_m**2
-    widening = size_m**2 * effects @ effects.T
-    included = included_m**2 * effects @ effects.T
+    optimum = found.searches[0].optimum
+    widening, included = size_m**2 * bodies.effects @ bodies.effects.T, np.zeros_like(before_ns2)
+    if OFFSET_OF_BODIES in optimum.layout.where:
+        included = of_prior(
+            optimum, optimum.priors.keys.index((OFFSET_OF_BODIES, 0)), optimum.layout.indices(["delay"])
+        )
+        widening = max(size_m / optimum.priors.deviation(OFFSET_OF_BODIES), 1.0) ** 2 * included
     # The common part of all delays also depends on the curve, and is far less certain.
     apart = np.eye(len(before_ns2)) - 1 / max(len(before_ns2), 1)
     own, more = (np.diag(apart @ one @ apart) for one in (before_ns2 - included, widening))

@@ -118,7 +118,15 @@ def of_weights(optimum: Optimum, keep: Ints) -> Floats:
 def of_few_draws(optimum: Optimum, keep: Ints) -> Floats:
     """Return the covariance (k, k) that is added to the covariance of some unknowns (k,), because few values determine
     the variance of a prior: its part of the covariance is scaled from a normal distribution to Student's t."""
-    found, priors, reach = np.zeros((len(keep),) * 2), optimum.priors, optimum.covariance[:, keep]
-    for (where, prior), weight, structure in zip(priors.all, priors.weights, priors.structures, strict=True):
-        found += (students_factor(prior.freedom) ** 2 - 1) * weight * reach[where].T @ (structure @ reach[where])
+    found = np.zeros((len(keep),) * 2)
+    for number, (_, prior) in enumerate(optimum.priors.all):
+        if np.isfinite(prior.freedom):
+            found += (students_factor(prior.freedom) ** 2 - 1) * of_prior(optimum, number, keep)
     return found
+
+
+def of_prior(optimum: Optimum, number: int, keep: Ints) -> Floats:
+    """Return the part (k, k) of the covariance of some unknowns (k,) that a prior, by its number, has as knowledge."""
+    priors = optimum.priors
+    reach = optimum.covariance[:, keep][priors.all[number][0]]
+    return np.asarray(priors.weights[number] * reach.T @ (priors.structures[number] @ reach))

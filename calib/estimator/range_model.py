@@ -336,7 +336,7 @@ def _offsets(
     number, count = pairs.number[:, None], len(ranges.sessions)
     known = np.eye(len(pairs.ends)) if settings.constants == "pair" else free_ends(pairs, tags, settings)
     determined = _rank(known) + sum(one is None for one in carriers)
-    # What is between two bodies lengthens the ranges of all their pairs. Obstacles make ranges noisy, and change means.
+    # An obstacle changes the mean of the ranges between two bodies, or of a pair, and makes them noisy.
     group = pairs_of_bodies(pairs, dict(ranges.bodies)) if OFFSET_OF_BODIES in kinds else None
     if group is not None:
         owners = np.eye(int(group.max()) + 1)[group]

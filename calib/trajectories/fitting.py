@@ -21,13 +21,7 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.inverse import Matrix, inverse_of
 from calib.estimator.known_distances import Fitted, RangeFit, model_of, with_covariances
 from calib.estimator.losses import MIXTURE
-from calib.estimator.range_model import (
-    BOARD_DELAY_STD_NS,
-    DELAY_NS,
-    METRES_A_NS,
-    OFFSET_OF_PAIR,
-    RangeModel,
-)
+from calib.estimator.range_model import BOARD_DELAY_STD_NS, DELAY_NS, METRES_A_NS, OFFSET_OF_PAIR, RangeModel
 from calib.estimator.rows import sum_rows
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
