@@ -92,7 +92,7 @@ def maximize(  # noqa: PLR0913 - a search has that many sides
     most, near, shorter = MOST_STEPS if steps is None else steps, 0, 0
     # The last 3 to 20 steps give equal results (Nocedal and Wright 2006, section 7.2).
     changes = deque[tuple[Floats, Floats]](maxlen=10)
-    sums = Sums(-np.inf, np.zeros_like(x), np.zeros((0, 0)))
+    sums = Sums(-np.inf, np.zeros_like(x), np.zeros((0, 0)), np.zeros((0, 0)))
     best, gain, promised, settled, taken = -np.inf, np.inf, 0.0, False, 0
     best_x, slope, step = x, np.zeros_like(x), np.zeros_like(x)
     while taken < most and not settled:
@@ -116,7 +116,7 @@ def maximize(  # noqa: PLR0913 - a search has that many sides
         known = sums.information + precision
         slope = sums.gradient + priors.pull(x)
         bent = [(moved, _damped(moved, fell + precision @ moved, known @ moved)) for moved, fell in changes]
-        quick = inverse_of(_with_logarithms(known, layout, sums.gradient, longer), free)
+        quick = inverse_of(_with_logarithms(sums.curvature + precision, layout, sums.gradient, longer), free)
         step = _corrected(quick, slope, bent)
         reach = float(slope @ (quick @ slope)) / max(float(step @ known @ step), 1e-300)
         step *= min(1.0, longer * reach**0.5) if reach > 0 else 1.0

@@ -18,7 +18,7 @@ from scipy.special import expit
 
 from calib.estimator.inverse import Inverse, diagonal_of
 from calib.estimator.losses import Weights
-from calib.estimator.rows import ROWS_AT_ONCE, Squares, Terms
+from calib.estimator.rows import ROWS_AT_ONCE, Movable, Squares, Terms
 from calib.estimator.unknowns import Layout, Unknown
 from calib.range_errors.densities import ErrorSlopes, error_slopes
 from uwblink.arrays import Floats, Ints
@@ -53,13 +53,12 @@ def block_of(
 class Geometry(Protocol):
     """Distances that depend on unknowns: on positions, or on trajectories."""
 
-    @property
-    def columns(self) -> Ints:
-        """Return the indices (n, k) into all unknowns that each distance depends on."""
-        ...
-
     def distances(self, x: Floats, rows: Ints) -> tuple[Floats, Floats]:
         """Return the distances (m,) of some ranges at unknowns (p,), metres, and their derivatives (m, k)."""
+        ...
+
+    def movable(self, rows: Ints, derivative: Floats, bend: Floats) -> Movable:
+        """Return what some ranges depend on, from the derivatives (m, k) of their distances and bends (m,)."""
         ...
 
 
@@ -287,7 +286,7 @@ class RangeRows:
         for blocks, rows, values, _ in self._pieces(x):
             errors, unit = error_slopes(values[RESIDUAL], values), np.ones(rows.stop - rows.start)
             by_unknowns = self._as_terms(blocks, rows, 0.0, {RESIDUAL: unit}, None, None)
-            derivatives = by_unknowns.as_matrix(by_unknowns.slopes, by_unknowns.columns, self.layout.size)
+            derivatives = by_unknowns.as_matrix(by_unknowns.slopes, by_unknowns.score, self.layout.size)
             found[rows] = (errors.inlier - errors.reflected) * diagonal_of(derivatives, covariance)
         return replace(self, unsure_m2=found)
 
@@ -325,7 +324,7 @@ class RangeRows:
         return ErrorSlopes(log_density=log_density, by=by, reflected=reflected, inlier=inlier)
 
     def _pieces(self, x: Floats, only: tuple[str, ...] = ()) -> Iterator[tuple[slice, slice, dict[str, Floats], Any]]:
-        """Yield blocks, rows, parameters and derivatives of distances, for the rows that are computed at once."""
+        """Yield blocks, rows, parameters, and distances with derivatives, for the rows that are computed at once."""
         names = only or (RESIDUAL, *self.errors.parameters)
         edges, first = self.starts, 0
         while first < len(edges) - 1:
@@ -339,8 +338,8 @@ class RangeRows:
                     values[part.parameter] = values[part.parameter] + self._sum(part, x, blocks, rows, counts)
             moved = None
             if self.geometry is not None:
-                distance, moved = self.geometry.distances(x, self.order[rows])
-                values[RESIDUAL] = values[RESIDUAL] - distance
+                moved = self.geometry.distances(x, self.order[rows])
+                values[RESIDUAL] = values[RESIDUAL] - moved[0]
             yield blocks, rows, values, moved
             first = last
 
@@ -369,7 +368,8 @@ class RangeRows:
         """Return the terms of rows, with the given information, or by squares of slopes."""
         count, several = rows.stop - rows.start, blocks.stop - blocks.start
         starts = self.starts[blocks.start : blocks.stop + 1] - rows.start
-        columns, entries, names = [], list[Floats](), list[str]()
+        none = np.zeros((0, count))
+        columns, entries, names = [np.zeros((several, 0), dtype=np.int64)], list[Floats](), list[str]()
         for part in self.parts:
             if part.parameter not in by:
                 continue
@@ -377,30 +377,35 @@ class RangeRows:
             columns.append(np.broadcast_to(own + self.layout.where[part.kind].start, (several, own.shape[1])))
             entries.append(np.broadcast_to(1.0, (own.shape[1], count)) if part.values is None else part.values[:, rows])
             names.append(part.parameter)
-        if moved is not None and self.geometry is not None:
-            columns = [np.repeat(one, np.diff(starts), axis=0) for one in columns]
-            columns.append(self.geometry.columns[self.order[rows]])
-            starts = np.arange(count + 1)
-            entries.append(-moved.T)
-            names.append(RESIDUAL)
         stacked = np.concatenate(columns, axis=1)
 
-        def square(beside: dict[str, Floats], weight: float) -> Squares:
-            slopes = np.concatenate([beside[name] * one for name, one in zip(names, entries, strict=True)])
-            return Squares(columns=stacked, entries=slopes, residual=beside[RESIDUAL], weight=weight)
+        def square(beside: dict[str, Floats], weight: Floats | float) -> Squares:
+            slopes = [beside[name] * one for name, one in zip(names, entries, strict=True)]
+            return Squares(entries=np.concatenate([none, *slopes]), residual=beside[RESIDUAL], weight=weight)
 
         of_slopes = square(by, self.errors.dispersion)
         squares = [of_slopes]
         if information is not None:
-            chosen = [k for k, name in enumerate(names) if name == RESIDUAL]
-            by_residual = np.concatenate([columns[k] for k in chosen], axis=1)
-            of_residual, share = np.concatenate([entries[k] for k in chosen]), 1 / self.errors.dispersion
-            alone, ones = share * information.residual, np.ones(count)
-            directions = information.directions if len(chosen) < len(names) else ()
+            share = 1 / self.errors.dispersion
+            residual_alone = dict.fromkeys(names, np.zeros(count)) | {RESIDUAL: np.ones(count)}
+            directions = information.directions if set(names) - {RESIDUAL} else ()
             squares = [square(one, share) for one in directions]
-            squares.append(Squares(columns=by_residual, entries=of_residual, residual=ones, weight=alone))
-        slopes, score = of_slopes.entries, of_slopes.residual
-        return Terms(value=value, slopes=slopes, score=score, columns=stacked, starts=starts, squares=squares)
+            squares.append(square(residual_alone, share * information.residual))
+        slopes, score, movable = of_slopes.entries, of_slopes.residual, None
+        if moved is not None and self.geometry is not None:
+            distance, derivative = moved
+            # Below 10 cm a second derivative does not describe a step of a search.
+            bend = np.abs(score) / np.maximum(distance, 0.1)
+            movable = self.geometry.movable(self.order[rows], derivative, bend)
+        return Terms(
+            value=value,
+            slopes=slopes,
+            score=score,
+            columns=stacked,
+            starts=starts,
+            squares=squares,
+            movable=movable,
+        )
 
 
 def _sorted(part: Part, order: Ints, starts: Ints) -> Part:

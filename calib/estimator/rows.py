@@ -28,14 +28,28 @@ LONG_BLOCKS = 8
 class Squares:
     """Information of rows (n,): the sum of `weight`, one or (n,), times the outer square of `entries` (K, n).
 
-    The entries are those of the unknowns `columns` (blocks, K). `residual` (n,) are the entries of a unit offset of
-    each row's residual.
+    `residual` (n,) are the entries of a unit offset of each row's residual.
     """
 
-    columns: Ints
     entries: Floats
     residual: Floats
     weight: Floats | float = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Movable:
+    """Distances (n,) between points that unknowns move.
+
+    `derivative` (n, k) is that of a row's residual by the unknowns `columns` (n, k). The vector between both points has
+    the derivative `shares` (n, j) by the unknowns `axes` (n, 3, j) of each axis. `bend` (n,) is the size of the second
+    derivative of the log likelihood by movements across the distance: slope over distance, per square metre.
+    """
+
+    columns: Ints
+    derivative: Floats
+    axes: Ints
+    shares: Floats
+    bend: Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,12 +67,33 @@ class Terms:
     columns: Ints
     starts: Ints
     squares: Sequence[Squares]
+    movable: Movable | None = None
 
-    def as_matrix(self, values: Floats, columns: Ints, size: int) -> sparse.csr_matrix:
-        """Return values (K, n) at the columns (blocks, K) of the rows as a sparse matrix (n, size)."""
-        bounds = np.arange(values.shape[1] + 1) * len(values)
-        each = np.repeat(columns, np.diff(self.starts), axis=0)
-        return sparse.csr_matrix((values.T.ravel(), each.ravel(), bounds), shape=(values.shape[1], size))
+    def as_matrix(self, values: Floats, residual: Floats, size: int) -> sparse.csr_matrix:
+        """Return a sparse matrix (n, size): `values` (K, n) at the unknowns of blocks, and `residual` (n,) times the
+        derivatives of residuals by movements.
+        """
+        columns, entries = np.repeat(self.columns, np.diff(self.starts), axis=0), values.T
+        if self.movable is not None:
+            columns = np.concatenate([columns, self.movable.columns], axis=1)
+            entries = np.concatenate([entries, residual[:, None] * self.movable.derivative], axis=1)
+        return _matrix(columns, entries, size)
+
+    def gradient(self, size: int) -> Floats:
+        """Return the sum of the slopes by all unknowns (size,)."""
+        sums = np.add.reduceat(self.slopes, self.starts[:-1], axis=1)
+        found = np.zeros(size)
+        found += np.bincount(self.columns.ravel(), sums.T.ravel(), size)
+        if self.movable is not None:
+            by_movements = self.score[:, None] * self.movable.derivative
+            found += np.bincount(self.movable.columns.ravel(), by_movements.ravel(), size)
+        return found
+
+
+def _matrix(columns: Ints, entries: Floats, size: int) -> sparse.csr_matrix:
+    """Return entries (n, k) at columns (n, k) as a sparse matrix (n, size)."""
+    bounds = np.arange(len(columns) + 1) * columns.shape[1]
+    return sparse.csr_matrix((entries.ravel(), columns.ravel(), bounds), shape=(len(columns), size))
 
 
 class Rows(Protocol):
@@ -71,53 +106,105 @@ class Rows(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Sums:
-    """Log likelihood of all rows, its slope (p,), and the information of the rows (p, p), sparse for many unknowns."""
+    """Log likelihood of all rows, its slope (p,), and the information of the rows (p, p), sparse for many unknowns.
+
+    `curvature` (p, p) is the information plus the second derivatives of distances, with positive signs.
+    """
 
     value: float
     gradient: Floats
     information: Matrix
+    curvature: Matrix
 
 
 def sum_rows(rows: Sequence[Rows], x: Floats) -> Sums:
     """Sum over all rows at unknowns (p,)."""
-    size, value = len(x), 0.0
-    many = size > MOST_DENSE
-    gradient, square = np.zeros(size), np.zeros(0 if many else size * size)
-    loose: list[sparse.csr_matrix] = []
+    size, value, gradient = len(x), 0.0, np.zeros(len(x))
+    few = size <= MOST_DENSE
+    whole, loose, bends = np.zeros(size * size if few else 0), list[sparse.csc_matrix](), list[sparse.csc_matrix]()
     for kind in rows:
         for terms in kind.terms(x):
             value += terms.value
-            sums = np.add.reduceat(terms.slopes, terms.starts[:-1], axis=1)
-            gradient += np.bincount(terms.columns.ravel(), sums.T.ravel(), size)
-            for part in terms.squares:
-                # A common weight of all rows multiplies their products, which are fewer.
-                one = np.ndim(part.weight) == 0
-                weighed, times = (part.entries, part.weight) if one else (part.entries * part.weight, 1.0)
-                if part.entries.shape[1] < LONG_BLOCKS * len(part.columns):
-                    left, right = (terms.as_matrix(each, part.columns, size) for each in (weighed, part.entries))
-                    loose.append(left.T @ right * times)
-                    continue
-                products = _block_products(weighed, part.entries, terms.starts).ravel() * times
-                place = (part.columns[:, :, None] * size + part.columns[:, None, :]).ravel()
-                if many:
-                    loose.append(sparse.csr_matrix((products, divmod(place, size)), shape=(size, size)))
-                else:
-                    np.add.at(square, place, products)
-    if many:
-        return Sums(value, gradient, sparse.csc_matrix(sum(loose, sparse.csr_matrix((size, size)))))
-    found = square.reshape(size, size)
-    for product in loose:
-        found += product.toarray()
-    return Sums(value, gradient, found)
+            gradient += terms.gradient(size)
+            if terms.movable is None and terms.slopes.shape[1] < LONG_BLOCKS * len(terms.columns):
+                loose += _of_few_rows(terms, size)
+                continue
+            first, *others = (_block_products(part, terms.starts) for part in terms.squares)
+            products = sum(others, first).ravel()
+            place = (terms.columns[:, :, None] * size + terms.columns[:, None, :]).ravel()
+            if few:
+                np.add.at(whole, place, products)
+            else:
+                loose.append(_placed(products, place, size))
+            if terms.movable is not None:
+                loose.append(_of_movements(terms, terms.movable, size))
+                bends.append(_bends(terms.movable, size))
+    information = _plus(whole.reshape(size, size) if few else sparse.csc_matrix((size, size)), loose)
+    return Sums(value, gradient, information, _plus(information, bends))
 
 
-def _block_products(left: Floats, right: Floats, starts: Ints) -> Floats:
-    bounds = starts.tolist()
+def _plus(matrix: Matrix, parts: Sequence[sparse.csc_matrix]) -> Matrix:
+    """Return a matrix (p, p) plus sparse ones, as dense or sparse as the first."""
+    # Small ones first, because each sum takes as long as its larger part.
+    for part in sorted(parts, key=lambda one: one.nnz):
+        matrix = matrix + part
+    return sparse.csc_matrix(matrix) if sparse.issparse(matrix) else np.asarray(matrix)
+
+
+def _of_few_rows(terms: Terms, size: int) -> list[sparse.csc_matrix]:
+    """Return the information of rows as products of sparse matrices."""
+    found = list[sparse.csc_matrix]()
+    for part in terms.squares:
+        own = terms.as_matrix(part.entries, part.residual, size)
+        found.append(own.T @ sparse.diags(np.broadcast_to(part.weight, len(terms.score))) @ own)
+    return found
+
+
+def _placed(products: Floats, place: Ints, size: int) -> sparse.csc_matrix:
+    """Return products (n,) summed at their places (n,) in a matrix whose rows have `size` entries."""
+    if len(products) > size * size:
+        # Sorting so many entries would take longer.
+        whole = np.zeros(size * size)
+        np.add.at(whole, place, products)
+        return sparse.csc_matrix(whole.reshape(size, size))
+    return sparse.csc_matrix((products, divmod(place, size)), shape=(size, size))
+
+
+def _of_movements(terms: Terms, movable: Movable, size: int) -> sparse.csc_matrix:
+    """Return the information between the unknowns that move residuals, and between these and the others."""
+    own = _matrix(movable.columns, movable.derivative, size)
+    alone, across = np.zeros(len(terms.score)), np.zeros_like(terms.slopes)
+    for part in terms.squares:
+        pull = part.weight * part.residual
+        alone += pull * part.residual
+        across += pull * part.entries
+    others = _matrix(np.repeat(terms.columns, np.diff(terms.starts), axis=0), across.T, size)
+    half = sparse.csc_matrix(own.T @ (sparse.diags(0.5 * alone) @ own + others))
+    return sparse.csc_matrix(half + half.T)
+
+
+def _bends(movable: Movable, size: int) -> sparse.csc_matrix:
+    """Return the sizes of the second derivatives by movements of points, as a sum of squares.
+
+    The distance d of points with a vector v between them has the second derivative (I - v v'/d^2)/d. Its product with
+    the slope of the likelihood is replaced by its absolute value, and movements along v, whose information is much
+    larger, are included.
+    """
+    shares = np.broadcast_to((np.sqrt(movable.bend)[:, None] * movable.shares)[:, None, :], movable.axes.shape)
+    moved = _matrix(movable.axes.reshape(-1, shares.shape[-1]), shares.reshape(-1, shares.shape[-1]), size)
+    return sparse.csc_matrix(moved.T @ moved)
+
+
+def _block_products(part: Squares, starts: Ints) -> Floats:
+    """Return the sums of squares of each block (blocks, K, K)."""
+    # A common weight of all rows multiplies their products, which are fewer.
+    one = np.ndim(part.weight) == 0
+    left, bounds = part.entries if one else part.entries * part.weight, starts.tolist()
     found = np.empty((len(bounds) - 1, len(left), len(left)))
     for k in range(len(bounds) - 1):
         own = slice(bounds[k], bounds[k + 1])
-        np.matmul(left[:, own], right[:, own].T, out=found[k])
-    return found
+        np.matmul(left[:, own], part.entries[:, own].T, out=found[k])
+    return found * part.weight if one else found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,5 +242,5 @@ def normal_terms(left: Floats, std: Floats, derivative: Floats, columns: Ints) -
         score=-z / std,
         columns=columns,
         starts=np.arange(len(left) + 1),
-        squares=[Squares(columns=columns, entries=derivative / std, residual=-1 / std)],
+        squares=[Squares(entries=derivative / std, residual=-1 / std)],
     )

@@ -164,7 +164,7 @@ class Slopes:
         self.score, self.information = np.empty(len(rows)), np.zeros(len(rows))
         self.own = np.zeros((blocks.count, size))
         for which, terms in self._pieces():
-            slopes = terms.as_matrix(terms.slopes, terms.columns, size)
+            slopes = terms.as_matrix(terms.slopes, terms.score, size)
             self.own += (blocks.summing(self.order[which]) @ slopes).toarray()
             self.score[which] = terms.score
             for part in terms.squares:
@@ -209,8 +209,9 @@ class Slopes:
             rows = self.order[which]
             in_block, weights = self.blocks.summing(rows), sparse.diags(self.information[which])
             shared = [
-                terms.as_matrix(part.residual * part.weight * part.entries, part.columns, size)
+                terms.as_matrix(pull * part.entries, pull * part.residual, size)
                 for part in terms.squares
+                for pull in [part.residual * part.weight]
             ]
             last = [] if more is None else [sparse.csr_matrix(more[rows, None])]
             for own, derivative in zip(sums, derivatives, strict=True):

@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
-from calib.estimator.rows import NormalRows, Terms, normal_terms
+from calib.estimator.rows import Movable, NormalRows, Terms, normal_terms
 from calib.estimator.unknowns import Layout, Prior, Unknown
 from calib.evaluation.filters import GRAVITY_M_S2
 from calib.trajectories.samples import POINT_S, SAMPLE_S
@@ -215,6 +215,7 @@ class Distances:
 
     sides: tuple[RangeEnd, RangeEnd]
     columns: Ints
+    axes: Ints
 
     @classmethod
     def of(cls, motion: Motion, layout: Layout, ids: tuple[Ints, Ints], time_s: Floats) -> Distances:
@@ -222,15 +223,25 @@ class Distances:
         first, second = (RangeEnd.of(motion, layout, some, time_s) for some in ids)
         blocks = [part.reshape(len(time_s), -1) for side in (first, second) for part in (side.place, side.turn)]
         columns = np.concatenate(blocks, axis=1)
-        # If an end does not depend on an unknown, its entry is zero in a column that the other end uses. Between
-        # anchors at given positions no entry is used, and any column is valid.
-        return cls((first, second), np.maximum(np.where(columns < 0, columns.max(axis=1)[:, None], columns), 0))
+        axes = np.swapaxes(np.concatenate([first.place, second.place], axis=1), 1, 2)
+        return cls((first, second), _used(columns), _used(axes))
 
     @classmethod
     def of_ranges(cls, motion: Motion, layout: Layout) -> Distances:
         """Return the distances of the ranges of a motion's scene."""
         scene = motion.scene
         return cls.of(motion, layout, (scene.ranges.initiator, scene.ranges.target), scene.time_s)
+
+    def movable(self, rows: Ints, derivative: Floats, bend: Floats) -> Movable:
+        """Return what some ranges depend on (`Geometry`)."""
+        first, second = (side.place_share[rows] for side in self.sides)
+        return Movable(
+            columns=self.columns[rows],
+            derivative=-derivative,
+            axes=self.axes[rows],
+            shares=np.concatenate([-first, second], axis=1),
+            bend=bend,
+        )
 
     def antennas(self, x: Floats, rows: Ints | slice = slice(None)) -> tuple[Floats, Floats, Floats, Floats]:
         """Return the antennas of both ends (n, 3), and their lever arms in the world's axes (n, 3)."""
@@ -261,6 +272,14 @@ class Distances:
         found = np.zeros((len(rows), len(x)))
         np.add.at(found, (np.arange(len(rows))[:, None], self.columns[rows]), self.distances(x, rows)[1])
         return found
+
+
+def _used(columns: Ints) -> Ints:
+    """Return columns (n, ..., k) in which -1, no unknown, is replaced by another one of the same row.
+
+    Its entry is zero. Between anchors at given positions no entry is used, and any column is valid.
+    """
+    return np.maximum(np.where(columns < 0, columns.max(axis=-1, keepdims=True), columns), 0)
 
 
 @dataclass(frozen=True)

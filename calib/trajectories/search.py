@@ -42,6 +42,10 @@ LITTLE_LEVERAGE, MAX_LEVERAGE = 0.5, 0.9
 """Errors are estimated from ranges with a leverage up to the first value. Leverages are limited to the second, because
 residuals are divided by the root of 1 - leverage."""
 
+SMOOTHING = 4.0
+"""The likelihood of a mixture has many maxima, because bodies may move as reflected ranges say. It is first divided by
+this, so that the priors of motion weigh more."""
+
 MIN_RANGES_PER_PAIR = 15
 """With fewer ranges per pair, minus the number of unknowns per pair, all pairs share one error model."""
 
@@ -220,6 +224,8 @@ class Search:
         if self.free_ranges < MIN_RANGES_PER_PAIR * len(self.model.pairs.ends):
             unknowns = tuple(u if len(u.names) == 1 else _as_known(u, u.start) for u in unknowns)
         self.build(mixture, unknowns, parts)
+        self._restrict()
+        self.optimize(replace(mixture, dispersion=SMOOTHING))
         own, settled = self.layout.where["delay"], False
         # At most five rounds, because leverages change; they end if no delay moves by a tenth of its standard error.
         for turn in range(5):
@@ -290,7 +296,7 @@ def leverages(rows: RangeRows, found: Optimum) -> Floats:
     for terms in rows.terms(found.x):
         *shared, part = terms.squares
         weight = part.weight + sum(np.mean(one.residual**2) for one in shared)
-        matrix = terms.as_matrix(part.entries, part.columns, size)
+        matrix = terms.as_matrix(part.entries, part.residual, size)
         parts.append((matrix, np.broadcast_to(weight, matrix.shape[0])))
     weight = np.concatenate([known for _, known in parts])
     if "noise" in values:

@@ -1,5 +1,6 @@
 """Delays planted in flights without true distances: sums of sines, with positions known at the start only."""
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -8,7 +9,9 @@ import pytest
 
 import calib
 from benchmarks.trajectories import scenario
-from calib.estimator.unknowns import Layout
+from calib.estimator import rows as sums
+from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows
+from calib.estimator.unknowns import Layout, Unknown
 from calib.settings import FlightSettings
 from calib.trajectories.motion import Distances, Motion, known_rows
 from calib.trajectories.scene import scene_from
@@ -37,6 +40,8 @@ def test_planted_delays_are_found_from_a_known_start(flown):
     result = calib.fit_from_ranges(flown, poses_until_s=8.0, progress=shares.append)
     std = np.array(list(result.calibration.delays_std_ns.values()))
     assert result.success
+    # Without the second derivatives of distances a search takes more than a hundred steps.
+    assert int(re.fullmatch(r"converged after (\d+) steps", result.message)[1]) < 70
     # A sound flight has only the warning that it is short.
     assert [warning[:12] for warning in result.warnings] == ["only 14 s of"]
     # One flight of 14 s: a fit with all distances known has an error of 18 ps.
@@ -182,6 +187,51 @@ def laid_out():
     # Rotations are linear to first order only: at 1e-4 rad to a ten-thousandth of a lever arm.
     x[layout.where["turn"]] *= 1e-4
     return scene, motion, layout, x
+
+
+def mixture_rows(scene, motion):
+    """Return a layout of motion, delays of ten pairs and errors, and rows of a mixture with expected information."""
+    levels = {"noise": -3.0, "odds": -2.0, "detour": -0.5, "least": -3.0, "outliers": -4.0, "long": -3.0}
+    blocks = [Unknown(kind=kind, names=("",), start=np.full(1, level)) for kind, level in levels.items()]
+    delays = Unknown(kind="delay", names=("",) * 10, start=np.linspace(-0.1, 0.1, 10))
+    layout = Layout((*motion.unknowns({}, 8.0), delays, *blocks))
+    key = np.arange(len(scene.time_s)) % 10
+    parts = [Part(parameter=kind, kind=kind, columns=np.zeros((len(key), 1), dtype=np.int64)) for kind in levels]
+    parts.append(Part(parameter=RESIDUAL, kind="delay", columns=key[:, None]))
+    geometry = Distances.of_ranges(motion, layout)
+    return layout, RangeRows.of(scene.ranges.raw_m, key, parts, Mixture(expected=True), layout, geometry)
+
+
+@pytest.mark.parametrize("most", [0, 4000])
+def test_sums_over_ranges_of_moving_bodies_are_those_of_all_rows_one_by_one(laid_out, most, monkeypatch):
+    monkeypatch.setattr(sums, "MOST_DENSE", most)
+    scene, motion, *_ = laid_out
+    layout, rows = mixture_rows(scene, motion)
+    rng = np.random.default_rng(5)
+    x, step = layout.start() + 1e-3 * rng.normal(size=layout.size), rng.normal(size=layout.size)
+    # Bodies at rest some metres from each other: errors of ranges are up to 2 m.
+    x[layout.where["path"]] += np.tile(rng.uniform(-2, 2, 9), motion.places.count)
+    found = sums.sum_rows([rows], x)
+    ahead, behind = (sums.sum_rows([rows], x + far * step).value for far in (1e-6, -1e-6))
+    assert found.gradient @ step == pytest.approx((ahead - behind) / 2e-6, rel=1e-4)
+    # The outer squares of whole rows of derivatives, by the information of each residual and the error parameters.
+    expected = np.zeros((layout.size, layout.size))
+    for terms in rows.terms(x):
+        for part in terms.squares:
+            every = terms.as_matrix(part.entries, part.residual, layout.size).toarray()
+            expected += every.T @ (every * np.broadcast_to(part.weight, len(every))[:, None])
+    information = found.information if most else found.information.toarray()
+    assert information == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
+    assert expected[layout.where["delay"], layout.where["path"]].any()
+    # Movements of the antennas, by differences of their positions, times slope over distance.
+    along = np.zeros(layout.size)
+    for kind in ("path", "stand"):
+        along[layout.where[kind]] = step[layout.where[kind]]
+    vectors = [second - first for far in (1, 0, -1) for first, second, *_ in [rows.geometry.antennas(x + far * along)]]
+    moved, distance = (vectors[0] - vectors[2]) / 2, np.linalg.norm(vectors[1], axis=1)
+    slope = rows.errors.slopes(rows.values(x))[1][RESIDUAL]
+    bends = np.abs(slope) / distance * np.sum(moved**2, axis=1)
+    assert along @ (found.curvature - found.information) @ along == pytest.approx(bends.sum(), rel=1e-6)
 
 
 def test_doubled_control_points_give_the_same_paths(laid_out):
