@@ -44,7 +44,8 @@ residuals are divided by the root of 1 - leverage."""
 
 SMOOTHING = 4.0
 """The likelihood of a mixture has many maxima, because bodies may move as reflected ranges say. It is first divided by
-this, so that the priors of motion weigh more."""
+this, so that the priors of motion weigh more. With half or twice of it, errors of flights with lasting reflections are
+the same to 3 ps; without it one of six has 101 instead of 46 ps."""
 
 MIN_RANGES_PER_PAIR = 15
 """With fewer ranges per pair, minus the number of unknowns per pair, all pairs share one error model."""
