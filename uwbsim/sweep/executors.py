@@ -223,6 +223,8 @@ class Processes(Workers):
                 list(pool.map(abs, range(self.size)))
         except BrokenProcessPool as error:
             self._held.close()
+            # CPython 3.11 prints a traceback if this process ends while a thread of the pool closes its pipe.
+            pool.shutdown()
             raise WorkersLostError(
                 "`workers`: a process ended at its start; check that there is enough memory, and that the script "
                 "starts its work below `if __name__ == '__main__':`; with 1 the work is done in this process"
