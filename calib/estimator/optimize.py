@@ -84,8 +84,8 @@ def maximize(  # noqa: PLR0913 - a search has that many sides
     corrected steps, as `LONGER` says.
 
     Squared slopes are only approximately the curvature: their inverse is corrected by the changes of slopes over the
-    last steps (L-BFGS: Nocedal and Wright 2006, algorithm 7.4), and for steps by `_with_logarithms`. The step is
-    shortened if the likelihood falls.
+    last steps (L-BFGS: Nocedal and Wright 2006, algorithm 7.4), and for steps by the second derivatives of distances
+    (`Sums`) and by `_with_logarithms`. The step is shortened if the likelihood falls.
     """
     layout, free = priors.layout, priors.layout.free()
     few = {k: one for k, one in enumerate(rows) if isinstance(one, RangeRows) and one.restricted}

@@ -18,7 +18,7 @@ from scipy.special import expit
 
 from calib.estimator.inverse import Inverse, diagonal_of
 from calib.estimator.losses import Weights
-from calib.estimator.rows import ROWS_AT_ONCE, Movable, Squares, Terms
+from calib.estimator.rows import ROWS_AT_ONCE, Movements, Squares, Terms
 from calib.estimator.unknowns import Layout, Unknown
 from calib.range_errors.densities import ErrorSlopes, error_slopes
 from uwblink.arrays import Floats, Ints
@@ -57,7 +57,7 @@ class Geometry(Protocol):
         """Return the distances (m,) of some ranges at unknowns (p,), metres, and their derivatives (m, k)."""
         ...
 
-    def movable(self, rows: Ints, derivative: Floats, bend: Floats) -> Movable:
+    def movements(self, rows: Ints, derivative: Floats, bend: Floats) -> Movements:
         """Return what some ranges depend on, from the derivatives (m, k) of their distances and bends (m,)."""
         ...
 
@@ -391,12 +391,13 @@ class RangeRows:
             directions = information.directions if set(names) - {RESIDUAL} else ()
             squares = [square(one, share) for one in directions]
             squares.append(square(residual_alone, share * information.residual))
-        slopes, score, movable = of_slopes.entries, of_slopes.residual, None
+        slopes, score, movements = of_slopes.entries, of_slopes.residual, None
         if moved is not None and self.geometry is not None:
             distance, derivative = moved
-            # Below 10 cm a second derivative does not describe a step of a search.
+            # Below 10 cm a second derivative does not describe a step of a search. With 5, 20 or 100 cm searches in two
+            # flights have the same steps.
             bend = np.abs(score) / np.maximum(distance, 0.1)
-            movable = self.geometry.movable(self.order[rows], derivative, bend)
+            movements = self.geometry.movements(self.order[rows], derivative, bend)
         return Terms(
             value=value,
             slopes=slopes,
@@ -404,7 +405,7 @@ class RangeRows:
             columns=stacked,
             starts=starts,
             squares=squares,
-            movable=movable,
+            movements=movements,
         )
 
 

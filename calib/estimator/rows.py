@@ -37,8 +37,8 @@ class Squares:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Movable:
-    """Distances (n,) between points that unknowns move.
+class Movements:
+    """Movements of the ends of distances (n,) by unknowns.
 
     `derivative` (n, k) is that of a row's residual by the unknowns `columns` (n, k). The vector between both points has
     the derivative `shares` (n, j) by the unknowns `axes` (n, 3, j) of each axis. `bend` (n,) is the size of the second
@@ -67,16 +67,16 @@ class Terms:
     columns: Ints
     starts: Ints
     squares: Sequence[Squares]
-    movable: Movable | None = None
+    movements: Movements | None = None
 
     def as_matrix(self, values: Floats, residual: Floats, size: int) -> sparse.csr_matrix:
         """Return a sparse matrix (n, size): `values` (K, n) at the unknowns of blocks, and `residual` (n,) times the
         derivatives of residuals by movements.
         """
         columns, entries = np.repeat(self.columns, np.diff(self.starts), axis=0), values.T
-        if self.movable is not None:
-            columns = np.concatenate([columns, self.movable.columns], axis=1)
-            entries = np.concatenate([entries, residual[:, None] * self.movable.derivative], axis=1)
+        if self.movements is not None:
+            columns = np.concatenate([columns, self.movements.columns], axis=1)
+            entries = np.concatenate([entries, residual[:, None] * self.movements.derivative], axis=1)
         return _matrix(columns, entries, size)
 
     def gradient(self, size: int) -> Floats:
@@ -84,9 +84,9 @@ class Terms:
         sums = np.add.reduceat(self.slopes, self.starts[:-1], axis=1)
         found = np.zeros(size)
         found += np.bincount(self.columns.ravel(), sums.T.ravel(), size)
-        if self.movable is not None:
-            by_movements = self.score[:, None] * self.movable.derivative
-            found += np.bincount(self.movable.columns.ravel(), by_movements.ravel(), size)
+        if self.movements is not None:
+            by_movements = self.score[:, None] * self.movements.derivative
+            found += np.bincount(self.movements.columns.ravel(), by_movements.ravel(), size)
         return found
 
 
@@ -126,7 +126,7 @@ def sum_rows(rows: Sequence[Rows], x: Floats) -> Sums:
         for terms in kind.terms(x):
             value += terms.value
             gradient += terms.gradient(size)
-            if terms.movable is None and terms.slopes.shape[1] < LONG_BLOCKS * len(terms.columns):
+            if terms.movements is None and terms.slopes.shape[1] < LONG_BLOCKS * len(terms.columns):
                 loose += _of_few_rows(terms, size)
                 continue
             first, *others = (_block_products(part, terms.starts) for part in terms.squares)
@@ -136,9 +136,9 @@ def sum_rows(rows: Sequence[Rows], x: Floats) -> Sums:
                 np.add.at(whole, place, products)
             else:
                 loose.append(_placed(products, place, size))
-            if terms.movable is not None:
-                loose.append(_of_movements(terms, terms.movable, size))
-                bends.append(_bends(terms.movable, size))
+            if terms.movements is not None:
+                loose.append(_of_movements(terms, terms.movements, size))
+                bends.append(_bends(terms.movements, size))
     information = _plus(whole.reshape(size, size) if few else sparse.csc_matrix((size, size)), loose)
     return Sums(value, gradient, information, _plus(information, bends))
 
@@ -170,9 +170,9 @@ def _placed(products: Floats, place: Ints, size: int) -> sparse.csc_matrix:
     return sparse.csc_matrix((products, divmod(place, size)), shape=(size, size))
 
 
-def _of_movements(terms: Terms, movable: Movable, size: int) -> sparse.csc_matrix:
+def _of_movements(terms: Terms, movements: Movements, size: int) -> sparse.csc_matrix:
     """Return the information between the unknowns that move residuals, and between these and the others."""
-    own = _matrix(movable.columns, movable.derivative, size)
+    own = _matrix(movements.columns, movements.derivative, size)
     alone, across = np.zeros(len(terms.score)), np.zeros_like(terms.slopes)
     for part in terms.squares:
         pull = part.weight * part.residual
@@ -183,15 +183,15 @@ def _of_movements(terms: Terms, movable: Movable, size: int) -> sparse.csc_matri
     return sparse.csc_matrix(half + half.T)
 
 
-def _bends(movable: Movable, size: int) -> sparse.csc_matrix:
+def _bends(movements: Movements, size: int) -> sparse.csc_matrix:
     """Return the sizes of the second derivatives by movements of points, as a sum of squares.
 
     The distance d of points with a vector v between them has the second derivative (I - v v'/d^2)/d. Its product with
     the slope of the likelihood is replaced by its absolute value, and movements along v, whose information is much
     larger, are included.
     """
-    shares = np.broadcast_to((np.sqrt(movable.bend)[:, None] * movable.shares)[:, None, :], movable.axes.shape)
-    moved = _matrix(movable.axes.reshape(-1, shares.shape[-1]), shares.reshape(-1, shares.shape[-1]), size)
+    shares = np.broadcast_to((np.sqrt(movements.bend)[:, None] * movements.shares)[:, None, :], movements.axes.shape)
+    moved = _matrix(movements.axes.reshape(-1, shares.shape[-1]), shares.reshape(-1, shares.shape[-1]), size)
     return sparse.csc_matrix(moved.T @ moved)
 
 

@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
-from calib.estimator.rows import Movable, NormalRows, Terms, normal_terms
+from calib.estimator.rows import Movements, NormalRows, Terms, normal_terms
 from calib.estimator.unknowns import Layout, Prior, Unknown
 from calib.evaluation.filters import GRAVITY_M_S2
 from calib.trajectories.samples import POINT_S, SAMPLE_S
@@ -232,10 +232,10 @@ class Distances:
         scene = motion.scene
         return cls.of(motion, layout, (scene.ranges.initiator, scene.ranges.target), scene.time_s)
 
-    def movable(self, rows: Ints, derivative: Floats, bend: Floats) -> Movable:
+    def movements(self, rows: Ints, derivative: Floats, bend: Floats) -> Movements:
         """Return what some ranges depend on (`Geometry`)."""
         first, second = (side.place_share[rows] for side in self.sides)
-        return Movable(
+        return Movements(
             columns=self.columns[rows],
             derivative=-derivative,
             axes=self.axes[rows],
