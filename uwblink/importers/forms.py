@@ -68,7 +68,10 @@ WORDS: Final = {
     "fpp": (
         r"(fpp?|(fp|first_?path)_?(power|pwr|rssi|level|leistung)|first_?path|(rssi|power|leistung)_?(fp|first_?path))"
     ),
-    "rxp": r"(rxp|rx_?(power|pwr|level|dbm)|rssi|total_?power|pr)",
+    "rxp": (
+        r"(rxp|rx_?(power|pwr|level|dbm)|rssi|total_?power|pr|signal_?(level|strength|staerke)|"
+        r"(empfangs_?|signal_?)?pegel|empfangs_?leistung)"
+    ),
     "skew": r"(skew|cfo|carrier|clock_?offset)",
     "sts": r"sts(_?(q|qual|quality))?(_?(idx|index))?",
     "temperature": r"(temp(eratur(e)?)?|t_?celsius)(_?(deg_?)?c(elsius)?)?",

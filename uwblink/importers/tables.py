@@ -23,7 +23,7 @@ from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
-from typing import IO, Any, Final
+from typing import IO, Any, Final, NamedTuple
 
 import duckdb
 import numpy as np
@@ -73,19 +73,40 @@ def check_text(path: Path, raw: bytes) -> None:
         raise ImportTableError(f"{path}: not a text file (it contains zero bytes); expected a table in UTF-8")
 
 
-def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, bool, int]:
+class Dialect(NamedTuple):
+    """The form of a CSV file: names of columns, delimiter, decimal mark, encoding, and lines before the first values.
+
+    Text that is not UTF-8 is taken as Latin-1, which older programs write.
+    """
+
+    names: tuple[str, ...]
+    delimiter: str
+    decimal_comma: bool
+    skip: int
+    encoding: str
+
+
+def _decoded(raw: bytes) -> tuple[str, str]:
+    """Return the text of the first bytes of a file, and its encoding as DuckDB calls it."""
+    try:
+        # A letter of several bytes may be cut at the end, which this decoder waits for.
+        return codecs.getincrementaldecoder("utf-8-sig")().decode(raw), "utf-8"
+    except UnicodeDecodeError:
+        return raw.decode("latin-1"), "latin-1"
+
+
+def detect(path: Path, column_map: ColumnMap) -> Dialect:
     """Return the dialect of a CSV file by its first 64 KiB, for parts that the map does not state.
 
-    It consists of the names of the columns, the delimiter, whether the decimal mark is a comma, and the number of lines
-    before the first row of values. Without a header the names are "1", "2" and so on. Lines before the header that are
-    empty or begin with "#" are skipped. Raises `ImportTableError` for a file that is not text with a header.
+    Without a header the names are "1", "2" and so on. Lines before the header that are empty or begin with "#" are
+    skipped. Raises `ImportTableError` for a file that is not text with a header.
     """
     delimiter, decimal = column_map.delimiter, column_map.decimal
     with reading(path), open_file(path) as file:
         raw = file.read(65_536)
         check_text(path, raw)
-        # A letter of several bytes may be cut at the end of the read bytes.
-        lines = raw.decode("utf-8-sig", errors="strict" if len(raw) < 65_536 else "ignore").splitlines()
+        text, encoding = _decoded(raw)
+        lines = text.splitlines()
         first = next((k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
         mark = delimiter or _delimiter(lines[first:])
         reader = csv.reader((f"{line}\n" for line in lines[first:]), delimiter=mark)
@@ -102,7 +123,7 @@ def detect(path: Path, column_map: ColumnMap) -> tuple[tuple[str, ...], str, boo
             for digits, mark in (("+", ","), ("*", r"\."))
         )
         decimal = "," if commas > points else "."
-    return names, mark, decimal == "," and mark != ",", skip
+    return Dialect(names, mark, decimal == "," and mark != ",", skip, encoding)
 
 
 def lacks_header(names: Sequence[str]) -> bool:
@@ -263,7 +284,7 @@ class SourceTable:
             raise ImportTableError(
                 f"{self.path}: the key each is for JSON lines, bags and logs (with line), not for tables"
             )
-        self.names, mark, self._decimal_comma, self._skip = detect(self.path, self.column_map)
+        self.names, mark, self._decimal_comma, self._skip, encoding = detect(self.path, self.column_map)
         check_lines(self.path, mark)
         self._cells = [f"c{k}" for k in range(len(self.names))]
         columns = ", ".join(f"'{cell}': 'VARCHAR'" for cell in self._cells)
@@ -272,7 +293,7 @@ class SourceTable:
             f"read_csv({self._file}, auto_detect=false, header=false, skip={self._skip}, "
             f"delim='{mark}', quote='\"', escape='\"', columns={{{columns}}}, null_padding=true, store_rejects=true, "
             f"rejects_limit=0, rejects_table='rejects{self._key}', rejects_scan='scans{self._key}', "
-            f"max_line_size={MAX_LINE_BYTES})"
+            f"encoding='{encoding}', max_line_size={MAX_LINE_BYTES})"
         )
 
     def _open_log(self) -> None:

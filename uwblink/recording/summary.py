@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import as_html, cut, first_few, printable
 from uwblink.recording.schema import TABLES, Fault, Tag
-from uwblink.twr import STAMPS, Exchanges, intervals, names_in, of_protocol, without_stamps
+from uwblink.twr import STAMPS, Exchanges, intervals, of_protocol, without_stamps
 
 if TYPE_CHECKING:
     from uwblink.recording.file import Recording
@@ -223,8 +223,8 @@ class Summary:
 
     Exchanges with two reports are counted once: `reported_twice` is their number, and `contradictory` the number of
     those with different reports. `span_s` is the time from the first to the last exchange, or difference of arrival if
-    there are no exchanges; `provenance` are the entries of `meta` without scenario and planted values. `skews` are
-    those of pairs with exchanges of three messages.
+    there are no exchanges; the protocol of exchanges without stamps is "unknown"; `provenance` are the entries of
+    `meta` without scenario and planted values. `skews` are those of pairs with exchanges of three messages.
     """
 
     file: str
@@ -319,7 +319,9 @@ def summarize(recording: Recording) -> Summary:
             ids, counts = np.unique(e.initiator << 16 | e.target, return_counts=True)
             for pair, count in zip(ids.tolist(), counts.tolist(), strict=True):
                 pairs[pair >> 16, pair & 0xFFFF] += count
-            protocols.update({name: int(np.count_nonzero(e.protocol == name)) for name in names_in(e.protocol)})
+            # Ranges without stamps do not show their protocol.
+            names, counts = np.unique(np.where(without_stamps(e), "unknown", e.protocol), return_counts=True)
+            protocols.update(dict(zip(names.tolist(), counts.tolist(), strict=True)))
             yield e
 
     skews = clock_skews(counting())

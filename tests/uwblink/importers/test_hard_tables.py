@@ -27,7 +27,7 @@ from tests.uwblink.importers.test_table_forms import (
     wrapped,
     write,
 )
-from uwblink import Contents, Exchanges, errors, import_recording, load, register_importer
+from uwblink import Contents, Exchanges, Recording, errors, import_recording, load, register_importer
 from uwblink.exporters import EXPORTERS, Exporter, export_recording
 from uwblink.importers import (
     IMPORTERS,
@@ -38,6 +38,7 @@ from uwblink.importers import (
     read_source,
     staging,
 )
+from uwblink.importers.guess import guess_map
 
 LINE = "0.5,1,2,3.25\n"
 HEAD = "time_s,from_id,to_id,range_m\n"
@@ -115,6 +116,20 @@ def test_a_table_of_unknown_columns_is_guessed_with_a_line_that_names_them(tmp_p
 
 class StrangeError(Exception):
     """An error class that only a plug-in has."""
+
+
+@pytest.mark.parametrize("rows", [3, 3000], ids=["short", "long"])  # a long one is read further than its form
+def test_a_table_in_latin_1_keeps_the_letters_of_columns_and_devices(tmp_path, rows):
+    table = "Zeit [s];Sender;Empfänger;Entfernung [m];Pegel [dBm]\n" + "0,5;Gerät 1;Straße;3,25;-81,5\n" * rows
+    (tmp_path / "r.csv").write_text(table, "latin-1")
+    guessed = guess_map(tmp_path / "r.csv")
+    (tmp_path / "map.toml").write_text(guessed.text)
+    import_recording(tmp_path / "r.csv", tmp_path / "r.uwb", map_file=tmp_path / "map.toml")
+    with Recording.open(tmp_path / "r.uwb") as recording:
+        assert not guessed.asked
+        assert {tag.body for tag in recording.tags()} == {"Gerät 1", "Straße"}
+        assert recording.exchanges().fpp2_dbm.tolist() == [-81.5] * rows
+        assert recording.show().protocols == {"unknown": rows}
 
 
 def fails(*_):
