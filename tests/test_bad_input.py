@@ -159,6 +159,7 @@ WORDS = [
     ("uwblink poses {f_uwb} --from {zeros_csv}", ["zeros.csv", "not a text file"]),
     ("uwblink poses {f_uwb} --from {wide_csv}", ["wide.csv", "UTF-16", "UTF-8"]),
     # Only recordings have this ending.
+    ("uwblink import {r_csv} -o o.uwb", ["r.csv", "import guess"]),
     ("uwblink import guess {r_csv} -o o.uwb", ["o.uwb", ".uwb is the ending of recordings"]),
     ("calib fit {f_uwb} -o o.uwb", ["o.uwb", ".uwb is the ending of recordings"]),
     ("calib apply {f_uwb} -c {c_json} --to csv -o o.uwb", ["o.uwb", ".uwb is the ending of recordings"]),

@@ -53,6 +53,9 @@ class ImportGroup(Group):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a command by its name, None if there is none."""
         if cmd_name not in uwblink.importers.IMPORTERS:
+            if Path(cmd_name).exists():
+                how = f"state how to read it, or try: uwblink import guess {quote(cmd_name)} -o map.toml"
+                raise ImportTableError(f"{cmd_name}: {how}")
             return super().get_command(ctx, cmd_name)
         row: Importer = uwblink.importers.IMPORTERS[cmd_name]
         source = f"measured{row.suffixes[0]}" if row.suffixes else "folder"
