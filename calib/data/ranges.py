@@ -116,15 +116,18 @@ class Ranges(ColumnTable):
 
     def __post_init__(self) -> None:
         """Fill missing columns: times of exchanges, one session, no listeners, and NaN for what is unknown."""
-        if len(self.valid_ns) != len(self.time_ns):
-            object.__setattr__(self, "valid_ns", self.time_ns)
-        if len(self.listener) != len(self.time_ns):
-            object.__setattr__(self, "listener", np.full(len(self.time_ns), -1))
-        if len(self.session) != len(self.time_ns):
-            object.__setattr__(self, "session", np.zeros(len(self.time_ns), dtype=np.int32))
-        for name, shape in (("toward", (2, 3)), ("temperature_c", (2,)), ("features", (len(FEATURES),))):
-            if len(getattr(self, name)) != len(self.time_ns):
-                object.__setattr__(self, name, np.broadcast_to(np.float32(np.nan), (len(self.time_ns), *shape)))
+        count, unknown = len(self.time_ns), np.float32(np.nan)
+        fillings: dict[str, tuple[Any, tuple[int, ...]]] = {
+            "valid_ns": (self.time_ns, ()),
+            "listener": (-1, ()),
+            "session": (np.int32(0), ()),
+            "toward": (unknown, (2, 3)),
+            "temperature_c": (unknown, (2,)),
+            "features": (unknown, (len(FEATURES),)),
+        }
+        for name, (value, shape) in fillings.items():
+            if len(getattr(self, name)) != count:
+                object.__setattr__(self, name, np.broadcast_to(value, (count, *shape)))
 
     @classmethod
     def from_exchanges(
