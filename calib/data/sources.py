@@ -8,7 +8,6 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from hashlib import sha256
-from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
@@ -102,21 +101,19 @@ def opened(data: Data) -> Iterator[tuple[str, Source]]:
 
     Raises the errors of `Recording.open`, and `BadInputError` for an object of another type.
     """
-    if isinstance(data, Recording):
-        yield data.path.name, RecordedSource(data)
-    elif isinstance(data, str | os.PathLike):
-        with Recording.open(data, memory_mb=256) as recording:
-            yield Path(data).name, RecordedSource(recording)
-    elif isinstance(data, Exchanges):
-        yield IN_MEMORY, Contents(exchanges=data)
-    elif is_frame(data):
-        yield "data frame", contents_of_frame(data)
-    elif isinstance(data, Ranges):
-        raise BadInputError("Ranges contain no positions of bodies; give the recording instead", parameter="data")
-    elif isinstance(data, Source):
-        yield str(getattr(data, "name", IN_MEMORY)), data
-    else:
-        raise _no_recording(data)
+    with held_open(data) as held:
+        if isinstance(held, Recording):
+            yield held.path.name, RecordedSource(held)
+        elif isinstance(held, Exchanges):
+            yield IN_MEMORY, Contents(exchanges=held)
+        elif is_frame(held):
+            yield "data frame", contents_of_frame(held)
+        elif isinstance(held, Ranges):
+            raise BadInputError("Ranges contain no positions of bodies; give the recording instead", parameter="data")
+        elif isinstance(held, Source):
+            yield str(getattr(held, "name", IN_MEMORY)), held
+        else:
+            raise _no_recording(held)
 
 
 def _no_recording(data: object) -> BadInputError:
