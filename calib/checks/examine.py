@@ -447,7 +447,8 @@ def examine(data: Data | Iterable[Data]) -> list[Finding]:
     for one in recordings:
         with opened(one) as (name, source):
             whole = view_of(name, source)
-        contents += [(name, fingerprint_of(whole.exchanges))] if len(whole.exchanges) else []
+        e = whole.exchanges
+        contents += [(name, fingerprint_of(e.time_ns, e.range_m))] if len(e) else []
         refuse_repeated(contents)
         found, view = _examine_recording(whole)
         prefix = f"{name}: " if len(recordings) > 1 else ""

@@ -162,19 +162,15 @@ def load_each(
     ]
     # Parts of one recording are `Ranges` with the same fingerprint of the recording, but with other rows.
     contents = [
-        ((part.source, _hashed(part.time_ns, part.raw_m)),) if isinstance(one, Ranges) else part.recordings
+        ((part.source, fingerprint_of(part.time_ns, part.raw_m)),) if isinstance(one, Ranges) else part.recordings
         for one, part in zip(given, parts, strict=True)
     ]
     refuse_repeated(recording for several in contents for recording in several)
     return [without_static(part) for part in parts] if trim_static else parts
 
 
-def fingerprint_of(exchanges: Exchanges, *more: Floats) -> str:
-    """Return a fingerprint of exchanges, and of `more` columns."""
-    return _hashed(exchanges.time_ns, exchanges.range_m, *more)
-
-
-def _hashed(*columns: Floats | Ints) -> str:
+def fingerprint_of(*columns: Floats | Ints) -> str:
+    """Return a fingerprint of a recording from columns that differ between recordings: times and ranges."""
     return sha256(b"".join(column.tobytes() for column in columns)).hexdigest()[:32]
 
 
@@ -363,7 +359,7 @@ def ranges_of(source: Source, name: str, *, truth: bool = True) -> tuple[Exchang
         text = f"{read}; if they are degrees Fahrenheit, import them again as (F - 32) / 1.8"
         warn(text, TemperatureWarning)
     bare = getattr(source, "differences", None) or {"difference_m": np.zeros(0)}
-    fingerprint = fingerprint_of(exchanges, bare["difference_m"])
+    fingerprint = fingerprint_of(exchanges.time_ns, exchanges.range_m, bare["difference_m"])
     return exchanges, replace(found, features=features_of(exchanges, source), recordings=((name, fingerprint),))
 
 
