@@ -19,7 +19,7 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.pairs import Pairs, pairs_of
 from calib.spread import less_medians, robust_spread
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
-from uwblink.errors import ArgumentError, ImportTableError, raising, warn
+from uwblink.errors import ArgumentError, ImportTableError, raising, restating, warn
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, known_delays
 from uwblink.recording.contents import Contents
@@ -473,10 +473,8 @@ def contents_of_frame(frame: Any, map_source: MapSource | None = None) -> Conten
     """Import a data frame as a table; notes of the import become Python warnings. Raises `BadInputError`."""
     from uwblink.importers import read_source
 
-    try:
+    with restating(BadInputError, ImportTableError, ArgumentError):
         found = read_source(frame, map_file=map_source)
-    except (ImportTableError, ArgumentError) as error:
-        raise BadInputError(str(error)) from error
     for note in found.meta.get("notes", ()):
         warn(note)
     return found

@@ -29,7 +29,7 @@ from calib.data.ranges import (
 from calib.errors import BadInputError, TemperatureWarning, UnanswerableError
 from uwblink.arrays import Floats, Ints, is_frame
 from uwblink.display import printable
-from uwblink.errors import warn
+from uwblink.errors import restating, warn
 from uwblink.recording.antenna_delays import AntennaDelays, delays_in_meta
 from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
@@ -212,10 +212,8 @@ def held_open(data: Data) -> AbstractContextManager[Data]:
 
 def antenna_delays_in(meta: Mapping[str, Any], source: str) -> AntennaDelays:
     """Return the programmed antenna delays in `meta`; raises `BadInputError` if their form is wrong."""
-    try:
+    with restating(BadInputError, ValueError, where=f"{source}: "):
         return delays_in_meta(meta)
-    except ValueError as error:
-        raise BadInputError(f"{source}: {error}") from error
 
 
 def planted_of(source: Source, name: str) -> Mapping[str, Any] | None:
