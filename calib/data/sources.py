@@ -217,12 +217,21 @@ def antenna_delays_in(meta: Mapping[str, Any], source: str) -> AntennaDelays:
 
 
 def planted_of(source: Source, name: str) -> Mapping[str, Any] | None:
-    """Return the planted parameters of a simulation, None without any; raises the errors of `check_planted`."""
-    found = getattr(source, "planted", None) or getattr(source, "meta", {}).get("planted")
-    if not isinstance(found, Mapping):
+    """Return the planted parameters of a simulation, None without any.
+
+    Raises `BadInputError`, whose text starts with `name`, for planted delays and curves of a wrong form.
+    """
+    planted = getattr(source, "planted", None) or getattr(source, "meta", {}).get("planted")
+    if not isinstance(planted, Mapping):
         return None
-    check_planted(found, name)
-    return found
+    for key, (read, form) in FORMS.items():
+        try:
+            if planted.get(key) is not None:
+                read(planted[key])
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
+            found = printable(repr(planted[key]))[:60]
+            raise BadInputError(f"{name}: planted: {key}: found {found}, expected {form}") from None
+    return planted
 
 
 def _why_no_power(exchanges: Exchanges) -> str:
@@ -254,17 +263,6 @@ def _why_no_truth(source: Source) -> str:
         f"its poses cover {spans[0][0]:.1f} to {spans[0][1]:.1f} s after the first pose, its exchanges "
         f"{spans[1][0]:.1f} to {spans[1][1]:.1f} s; shift the poses with 'uwblink poses --offset'"
     )
-
-
-def check_planted(planted: Mapping[str, Any], where: str) -> None:
-    """Raise `BadInputError`, whose text starts with `where`, for planted delays and curves of a wrong form."""
-    for key, (read, form) in FORMS.items():
-        try:
-            if planted.get(key) is not None:
-                read(planted[key])
-        except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
-            found = printable(repr(planted[key]))[:60]
-            raise BadInputError(f"{where}: planted: {key}: found {found}, expected {form}") from None
 
 
 def _delays(found: Any) -> None:
