@@ -66,7 +66,8 @@ def examine_fit(found: RangeFit) -> tuple[Floats, list[Finding]]:
     them.
     """
     slopes, louder, alone = found.slopes, change_per_decibel(found), len(found.searches) > 1
-    readings = None if alone else errors_of_readings(found.model, louder)
+    missing_m = None if alone else errors_of_readings(found.model, louder)
+    readings = None if missing_m is None else missing_m / max(_root_mean_square(missing_m), 1e-12)
     group = pairs_of_bodies(found.model.pairs, dict(found.model.ranges.bodies))
     of_bodies = [] if group is None else list(_of_bodies(found, group))
     tested = slopes.tests([*of_bodies, *families(found, louder, beside_curve=not alone)], readings)
@@ -81,8 +82,8 @@ def examine_fit(found: RangeFit) -> tuple[Floats, list[Finding]]:
         tested += found.slopes_of_heard.tests(list(_of_heard(found)))
     findings = _without_explained(search(tested, FIT_LEVELS["offsets"]))
     of_truth = list[Finding]()
-    if readings is not None and not any("scale" in one.names for one in findings):
-        of_truth = list(_beyond_noise(found.model, louder, noise, len(tested)))
+    if missing_m is not None and not any("scale" in one.names for one in findings):
+        of_truth = list(_beyond_noise(found.model, missing_m, noise, len(tested)))
     plain = found.covariances["delay"]
     for one in tested:
         if one.family.kind in ("pair", "session") and not len(one.family.fitted):
@@ -214,7 +215,9 @@ def errors_of_truth(model: RangeModel, *, scale: bool = True) -> dict[str, Float
 
 
 def errors_of_readings(model: RangeModel, louder_m: Floats) -> Floats | None:
-    """Return the error (n,) by noise of power readings, divided by its root mean square; None if there is none.
+    """Return the error (n,) by noise of power readings in metres, None if there is none.
+
+    It is divided by the ratio of noise and signal.
 
     A part of the error that depends on power remains; it is proportional to the difference between the power expected
     from distance and the reading (regression calibration: Carroll et al. 2006, chapter 4). Without this alternative
@@ -223,27 +226,20 @@ def errors_of_readings(model: RangeModel, louder_m: Floats) -> Floats | None:
     """
     if not np.any(louder_m) or not np.ptp(model.ranges.truth_m) > 0:
         return None
-    missing = _beside_readings(model, louder_m)
-    return np.asarray(missing / max(_root_mean_square(missing), 1e-12))
-
-
-def _beside_readings(model: RangeModel, louder_m: Floats) -> Floats:
-    """Return the error (n,) by noise of power readings, divided by the ratio of noise and signal."""
     decibels = 10 * np.log10(np.maximum(model.lifted, 1e-4))
     far = np.log(np.maximum(model.ranges.truth_m, 0.1))
     slope, level = np.polyfit(far, decibels, 1)
     return np.asarray(louder_m * (slope * far + level - decibels))
 
 
-def _beyond_noise(model: RangeModel, louder_m: Floats, noise: Tested, tried: int) -> Iterator[Finding]:
-    """Yield a finding if errors beside the readings of power are larger than the noise of readings causes.
+def _beyond_noise(model: RangeModel, missing_m: Floats, noise: Tested, tried: int) -> Iterator[Finding]:
+    """Yield a finding if errors beside the readings of power (`errors_of_readings`) are larger than their noise causes.
 
     They grow with distance. A scale of true distances has this effect, and so has noise that lasts, which differences
     of successive readings do not show. Such noise of up to a quarter of the signal is a tolerance: in nine kinds of
     sound flights (`make sound`), the ratio is up to 0.15.
     """
-    size_m = _root_mean_square(_beside_readings(model, louder_m))
-    ratio = noise_to_signal(model)
+    size_m, ratio = _root_mean_square(missing_m), noise_to_signal(model)
     for one in offsets_of(noise, tried, FIT_LEVELS["offsets"], (0.25 + ratio) * size_m):
         # Noise makes ranges longer where powers are higher than expected from the distance.
         if one.offset_m > 0:
