@@ -128,23 +128,25 @@ def _append(written: Recording, exchanges: Exchanges, applied: CorrectedRanges) 
     """Add corrected exchanges; return the numbers of all, of those outside the fitted powers, and of those without
     power.
     """
-    powered = np.isfinite(applied.lifted)
-    numbers = ("sigma_m", "sigma_total_m", "mean_error_m", "tail_share", "tail_probability")
-    corrected_m = np.where(powered, applied.corrected_m, applied.delay_corrected_m)
+    known = columns_of(applied)
     table: dict[str, NDArray[Any]] = {
         "time_ns": exchanges.time_ns,
         "initiator": exchanges.initiator,
         "target": exchanges.target,
         "raw_m": applied.raw_m,
-        "corrected_m": corrected_m,
-        "clamped": applied.clamped,
+        "corrected_m": known.range_m,
+        "clamped": known.clamped,
         "outlier": applied.outlier,
-        **{name: np.where(powered, getattr(applied, name), np.nan) for name in numbers},
+        "sigma_m": known.sigma_m,
+        "sigma_total_m": known.sigma_total_m,
+        "mean_error_m": applied.mean_error_m,
+        "tail_share": known.tail_share,
+        "tail_probability": applied.tail_probability,
     }
     with written.transaction():
-        written.append_exchanges(replace(exchanges, range_m=corrected_m))
+        written.append_exchanges(replace(exchanges, range_m=known.range_m))
         written.append("corrected", table)
-    return len(exchanges), int(np.count_nonzero(applied.clamped)), int(np.count_nonzero(~powered))
+    return len(exchanges), int(np.count_nonzero(known.clamped)), int(np.count_nonzero(np.isnan(applied.lifted)))
 
 
 def live_correction(path: Path) -> Correction:
