@@ -364,10 +364,8 @@ def write(calibration: Value, adapter: TypeAdapter[Value]) -> str:
 
 def read(adapter: TypeAdapter[Value], text: str, where: str) -> Value:
     """Return the object that an adapter reads from JSON text; raises `BadInputError` that names `where` and the key."""
-    try:
+    with raising(BadInputError, f"{where}: not JSON", ValueError, RecursionError):
         table = json.loads(text, parse_float=finite, parse_constant=finite)
-    except (ValueError, RecursionError) as error:
-        raise BadInputError(f"{where}: not JSON ({error})") from error
     if not isinstance(table, dict) or "schema_version" not in table:
         raise BadInputError(f"{where}: not a calibration (no schema_version)")
     if table["schema_version"] not in range(1, 8):
