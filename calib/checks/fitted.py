@@ -15,7 +15,7 @@ from scipy.special import expit, ndtr
 
 from calib.calibration.power_curves import basis
 from calib.checks.places import place_covariance
-from calib.estimator.arrival_rows import OFFSET_OF_PATH, PATH_SIGNS
+from calib.estimator.arrival_rows import OFFSET_OF_PATH, PATH_SIGNS, ArrivalModel
 from calib.estimator.covariance import of_few_draws
 from calib.estimator.inverse import positive_part
 from calib.estimator.known_distances import RangeFit
@@ -78,8 +78,8 @@ def examine_fit(found: RangeFit) -> tuple[Floats, list[Finding]]:
         tested = [*(one.with_fitted([-1]).combined(np.eye(len(one.total))[:-1]) for one in tested), noise]
     # Offsets of bodies are a separate question, with its own share of the false alarms.
     bodies = [tested.pop(0) for _ in of_bodies]
-    if found.slopes_of_heard is not None:
-        tested += found.slopes_of_heard.tests(list(_of_heard(found)))
+    if found.slopes_of_heard is not None and (arrivals := found.searches[0].arrivals) is not None:
+        tested += found.slopes_of_heard.tests(_of_heard(found, arrivals))
     findings = _without_explained(search(tested, FIT_LEVELS["offsets"]))
     of_truth = list[Finding]()
     if missing_m is not None and not any("scale" in one.names for one in findings):
@@ -150,19 +150,17 @@ def families(found: RangeFit, louder_m: Floats, *, beside_curve: bool) -> Iterat
         yield Family(kind="shared", names=list(shared), derivative=Derivative(everyone, values, len(shared)))
 
 
-def _of_heard(found: RangeFit) -> Iterator[Family]:
-    """Yield offsets of differences of arrival: of targets, if their ranges contradict these, and of paths
+def _of_heard(found: RangeFit, arrivals: ArrivalModel) -> list[Family]:
+    """Return offsets of differences of arrival: of targets, if their ranges contradict these, and of paths
     to listeners.
     """
-    search = found.searches[0]
-    arrivals = search.arrivals
-    if arrivals is not None:
-        tags = found.model.tags
-        target = Derivative(np.searchsorted(tags, arrivals.targets)[:, None], UNIT, len(tags))
-        yield Family(kind="heard", names=[f"tag {tag}" for tag in tags], derivative=target)
-        path = Derivative(arrivals.path, PATH_SIGNS[None], len(arrivals.paths))
-        fitted = search.optimum.layout.indices([OFFSET_OF_PATH])
-        yield Family(kind="path", names=arrivals.paths, derivative=path, fitted=fitted)
+    tags, fitted = found.model.tags, found.searches[0].optimum.layout.indices([OFFSET_OF_PATH])
+    target = Derivative(np.searchsorted(tags, arrivals.targets)[:, None], UNIT, len(tags))
+    path = Derivative(arrivals.path, PATH_SIGNS[None], len(arrivals.paths))
+    return [
+        Family(kind="heard", names=[f"tag {tag}" for tag in tags], derivative=target),
+        Family(kind="path", names=arrivals.paths, derivative=path, fitted=fitted),
+    ]
 
 
 def _of_bodies(found: RangeFit, group: Ints) -> Iterator[Family]:
