@@ -25,7 +25,7 @@ from calib.checks.examine import examine
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data, each, held_open, load_each, load_ranges, opened
 from calib.errors import BadInputError, UnanswerableError
-from calib.evaluation.localization import Localization, localize, summarize
+from calib.evaluation.localization import Localization, localization_json, localize
 from calib.evaluation.onboard import OnboardTrack
 from calib.evaluation.statistics import Evaluation, evaluate
 from calib.evaluation.team import RelativePose
@@ -202,17 +202,7 @@ class Campaign(Results):
             "findings": [{"recording": name} | asdict(finding) for name, finding in self.findings],
         }
         if self.tracks:
-            plain["localization"] = {
-                "scenarios": [
-                    {
-                        "recording": t.source,
-                        "body": t.body,
-                        "rmse_m": {name: float(rmse.mean()) for name, rmse in t.rmse_m.items()},
-                    }
-                    for t in self.tracks
-                ],
-                "summary": asdict(summarize(self.tracks)),
-            }
+            plain["localization"] = localization_json(self.tracks)
         return plain
 
 
