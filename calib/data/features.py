@@ -69,13 +69,9 @@ def _responses(source: object) -> Iterable[Columns]:
         for start_ns, end_ns in pairwise([*edges[:-1], edges[-1] + 1] if edges else []):
             yield recording.columns("cirs", start_ns, end_ns)
     elif rows := getattr(source, "cirs", None):
-        yield {name: _column([getattr(row, name) for row in rows]) for name in CirRow.__dataclass_fields__}
-
-
-def _column(values: list[Any]) -> NDArray[Any]:
-    column = np.empty(len(values), dtype=object if isinstance(values[0], tuple) else type(values[0]))
-    column[:] = values
-    return column
+        # Responses may differ in length.
+        kinds = {name: object if name == "magnitudes" else None for name in CirRow.__dataclass_fields__}
+        yield {name: np.array([getattr(row, name) for row in rows], dtype=kind) for name, kind in kinds.items()}
 
 
 def _exchange_of(exchanges: Exchanges, rows: Columns) -> tuple[Ints, Ints]:
