@@ -21,7 +21,7 @@ from calib.calibration.model import Calibration
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
 from calib.range_errors.densities import ONE_KIND, ROOT_2PI, LongDetours, densities
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import ArrayRows, Bools, Floats, Ints
 
 __all__ = ["DelayStates", "RangeUpdate"]
 
@@ -247,7 +247,7 @@ FIXED_DELAYS: Final = DelayStates()
 
 
 @dataclass(frozen=True, kw_only=True)
-class RangeUpdate:
+class RangeUpdate(ArrayRows):
     """Corrected ranges (n,) as measurements of any filter or smoother.
 
     A range `measured_m` is the distance of two antennas, plus `delay_slopes` (n, 2) times the changes of the delays of
@@ -310,8 +310,7 @@ class RangeUpdate:
 
     def at(self, rows: Any) -> RangeUpdate:
         """Return some of the ranges."""
-        names = ("measured_m", "noise_m", "ends", "delay_slopes")
-        return RangeUpdate(errors=self.errors.at(rows), **{name: getattr(self, name)[rows] for name in names})
+        return replace(self[rows], errors=self.errors.at(rows))
 
     @cached_property
     def likeliest(self) -> tuple[Floats, WeighedInnovation]:

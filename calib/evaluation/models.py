@@ -11,11 +11,11 @@ import numpy as np
 
 from calib.evaluation.filters import GaussianFilters
 from calib.online import FIXED_DELAYS, DelayStates, RangeErrors, Reflections, WeighedInnovation, gated_update
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import ArrayRows, Bools, Floats, Ints
 
 
 @dataclass(frozen=True, slots=True)
-class FilterRanges:
+class FilterRanges(ArrayRows):
     """The measurements (n,) of a filter, the standard deviation of each one's independent error, and its error model,
     if any.
 
@@ -42,9 +42,7 @@ class FilterRanges:
 
     def at(self, rows: Ints) -> FilterRanges:
         """Return some measurements."""
-        names = ("measured_m", "std_m", "common_m", "shared_m", "delay_slopes")
-        some = {name: x[rows] for name in names if (x := getattr(self, name)) is not None}
-        return replace(self, **some, errors=None if self.errors is None else self.errors.at(rows))
+        return replace(self[rows], errors=None if self.errors is None else self.errors.at(rows))
 
 
 def side_by_side(filters: Sequence[FilterRanges]) -> Iterator[Floats]:
