@@ -165,17 +165,17 @@ def warn_of_directions(lacking: int, count: int, source: str) -> None:
         )
 
 
-def warn_of_temperatures(calibration: Calibration, ranges: Ranges, beyond_k: float = 5.0) -> None:
-    """Give a `TemperatureWarning` that names tags with temperatures more than `beyond_k` outside the fitted ones.
+def warn_of_temperatures(calibration: Calibration, ranges: Ranges) -> None:
+    """Give a `TemperatureWarning` that names tags with temperatures more than 5 K outside the fitted ones.
 
     Within 5 K a slope with an error of half of the manual's 2.15 mm/K (DW1000 user manual, section 8.3.1) changes
     ranges by 5 mm, less than their repeatability.
     """
     for low, high in sorted({one.span_c for one in calibration.temperatures}):
         with np.errstate(invalid="ignore"):
-            outside = (ranges.temperature_c < low - beyond_k) | (ranges.temperature_c > high + beyond_k)
+            outside = (ranges.temperature_c < low - 5.0) | (ranges.temperature_c > high + 5.0)
         fitted = {tag for one in calibration.temperatures if one.span_c == (low, high) for tag in one.tags}
         if tags := sorted(fitted & {*ranges.ends[outside].tolist()}):
             named = first_few(map(str, tags))
-            text = f"tags {named} were used more than {beyond_k:.0f} K outside the {low:.0f} to {high:.0f} °C at which"
+            text = f"tags {named} were used more than 5 K outside the {low:.0f} to {high:.0f} °C at which"
             warn(f"{text} the calibration was fitted; the correction is extrapolated", TemperatureWarning)

@@ -123,14 +123,14 @@ def populated(ordered: Floats) -> tuple[float, float]:
     return low, high
 
 
-def knots_for(ordered: Floats, segments: int, span: tuple[float, float] | None = None) -> Floats:
+def knots_for(ordered: Floats, segments: int, span: tuple[float, float]) -> Floats:
     """Return clamped knots of a cubic spline with a number of segments, for lifted powers, sorted (n,).
 
-    They lie in `span`, by default the `populated` range, halfway between segments of equal counts and of equal lengths.
+    They lie in `span`, halfway between segments of equal counts and of equal lengths.
     With equal counts, one long segment would cover the sparse high powers; with equal lengths, some segments would have
     no data.
     """
-    low, high = span or populated(ordered)
+    low, high = span
     quantiles = np.clip(np.quantile(ordered, np.linspace(0, 1, segments + 1)), low, high)
     inner = (quantiles + np.linspace(low, high, segments + 1)) / 2
     inner[[0, -1]] = low, high

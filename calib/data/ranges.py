@@ -606,17 +606,16 @@ def _sessions(parts: Sequence[Ranges]) -> tuple[Ints, tuple[str, ...]]:
     return np.concatenate(number), tuple(names)
 
 
-def without_static(ranges: Ranges, *, span_s: float = 2.0, within_m: float = 0.02) -> Ranges:
-    """Leave out spans of `span_s` seconds in which the distance of a pair changes by at most `within_m` metres.
+def without_static(ranges: Ranges) -> Ranges:
+    """Leave out spans of 2 s in which the distance of a pair changes by at most 2 cm.
 
     Bodies that stand still repeat one geometry, and with it one error. Raises `UnanswerableError` if nothing moves.
     """
-    span = (ranges.time_ns - ranges.time_ns.min()) // int(span_s * 1e9)
-    pairs = ranges.pairs
+    span, pairs = (ranges.time_ns - ranges.time_ns.min()) // 2_000_000_000, ranges.pairs
     group = np.unique(span * len(pairs.ends) + pairs.number, return_inverse=True)[1]
     every = np.arange(group.max() + 1)
     reach = ndimage.maximum(ranges.truth_m, group, every) - ndimage.minimum(ranges.truth_m, group, every)
-    moves = reach[group] > within_m
+    moves = reach[group] > 0.02
     if not moves.any():
         raise UnanswerableError(f"{ranges.source}: nothing moves, so `trim_static` removes all ranges")
     count = int(np.count_nonzero(~moves))
