@@ -340,7 +340,7 @@ def _largest_shift(finding: FoundOffset, covariance: Floats) -> float:
     std = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
     if not np.any(np.diag(covariance) > 0):
         # Without delays in the fit the curve absorbs an offset.
-        return abs(finding.offset_m) > SMALLEST_M
+        return np.inf if abs(finding.offset_m) > SMALLEST_M else 0.0
     if finding.kind == "time":
         # A delay that changed for a while is wrong by this change, then or at other times. The printed interval already
         # includes it: a permanent change looks like an error that lasts.
