@@ -89,8 +89,10 @@ def _warnings(results: Results) -> list[Block]:
 
 
 def _recordings(results: Results) -> list[Block]:
-    """Return a table with a row per recording, with the first 12 digits of the SHA-256 of its file."""
-    digests = {Path(path).name: digest[:12] for path, digest in results.origin.files.items()}
+    """Return a table with a row per recording, with the first 12 digits of the SHA-256 of the files of its name."""
+    digests: dict[str, list[str]] = {}
+    for path, digest in results.origin.files.items():
+        digests.setdefault(Path(path).name, []).append(digest[:12])
     tested = "test" if results.part is None else "held out"
     uses = [("fit", r) for r in results.training] + [(tested, r) for r in results.tests]
     header = ["recording", "use", "ranges", "seconds", "tags", "pairs", "protocol", "left out", "SHA-256"]
@@ -104,7 +106,7 @@ def _recordings(results: Results) -> list[Block]:
             str(len(pair_rows(r))),
             ", ".join(sorted(set(np.unique(r.protocol).tolist()))),
             ", ".join(f"{n} {why}" for why, n in r.excluded.items()) or "none",
-            digests.get(r.source, "in memory"),
+            " or ".join(digests.get(r.source, ["in memory"])),
         ]
         for use, r in uses
     ]

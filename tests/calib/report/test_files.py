@@ -94,6 +94,12 @@ def test_ranges_are_fitted_and_evaluated(campaign, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["mine.pdf"]
 
 
+def test_recordings_of_one_name_have_the_digests_of_both_files(campaign, tmp_path):
+    files = {"first/a.uwb": "1" * 64, "second/a.uwb": "2" * 64}
+    replace(campaign, origin=replace(campaign.origin, files=files)).write(tmp_path / "r.html")
+    assert f"{'1' * 12} or {'2' * 12}" in (tmp_path / "r.html").read_text()
+
+
 @pytest.mark.usefixtures("sections")
 def test_without_tests_errors_are_those_of_held_out_ranges(campaign, folder, tmp_path):
     """The fourth, seventh and last tenth of the time evaluate a fit to the others; delays are those of a fit to all."""
