@@ -81,11 +81,12 @@ def ticks(view: RecordingView) -> Iterator[Candidate]:
 def single_as_double(view: RecordingView) -> Iterator[Candidate]:
     """Find double-sided exchanges without a third message."""
     e = view.exchanges
-    empty = 100 * float(np.mean(~np.isin(e.protocol, single_sided()) & (e.tx3 == 0) & (e.rx3 == 0)))
-    if empty > 50:
+    double = ~np.isin(e.protocol, single_sided())
+    empty = np.count_nonzero(double & (e.tx3 == 0) & (e.rx3 == 0)) / max(np.count_nonzero(double), 1)
+    if empty > 0.5:
         yield Candidate(
             "single-sided data taken for double-sided",
-            f"{empty:.0f} % of the double-sided exchanges have no third message",
+            f"{100 * empty:.0f} % of the double-sided exchanges have no third message",
         )
 
 

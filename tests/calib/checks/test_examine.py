@@ -136,6 +136,7 @@ def all_at(away_m):
 
 
 WRONG_SIGN = columns(lambda e: {"skew1_ppm": -e.skew1_ppm, "skew2_ppm": -e.skew2_ppm, "range_m": e.range_m * np.nan})
+MIXED = columns(lambda e: {"protocol": np.where(np.arange(len(e)) % 5 < 2, "ds", e.protocol)})
 SCALE = "scale of true distances"
 SS, DS_ALT, SS_CFO = (replace(BRIEF, protocol=name) for name in ("ss", "ds-alt", "ss-cfo"))
 UNREAD = "single-sided without carrier readings"
@@ -150,6 +151,7 @@ UNREAD = "single-sided without carrier readings"
         (replace(BRIEF, bits=40), partial(planted.as_read, protocol="ds-alt"), "another protocol", 'protocol = "ds"'),
         (BRIEF, partial(planted.as_read, bits=40), "timestamp width", "bits = 32"),
         (SS_CFO, partial(planted.as_read, protocol="ds"), "single-sided data taken for double-sided", ""),
+        (SS_CFO, MIXED, "single-sided data taken for double-sided", "100 % of the double-sided"),
         (BRIEF, poses_times(1000), "unit of the poses", 'distance = "mm"'),
         (BRIEF, poses_times(100), "unit of the poses", 'distance = "cm"'),
         (BRIEF, poses_times(1 / 0.0254), "unit of the poses", 'distance = "in"'),
