@@ -219,11 +219,12 @@ static int uwb_measured(double power_dbm) { return power_dbm > UWB_FAINTEST_DBM 
 static double uwb_lift(double power_dbm) { return pow(10.0, (power_dbm - UWB_ALPHA_DBM) / 10.0); }
 
 /* Compute the lifted power of an exchange. If one of its powers was not measured, it is replaced by the other.
-   Returns 1, or 0 if neither was measured. */
+   Returns 1, or 0 if neither was measured, but is needed: flat curves are the same at any power. */
 static int uwb_lifted(double *fpp1_dbm, double *fpp2_dbm, double *lifted)
 {
+    *lifted = UWB_LOWEST;
     if (!uwb_measured(*fpp1_dbm) && !uwb_measured(*fpp2_dbm))
-        return 0;
+        return !UWB_NEEDS_POWER;
     if (!uwb_measured(*fpp1_dbm))
         *fpp1_dbm = *fpp2_dbm;
     if (!uwb_measured(*fpp2_dbm))
@@ -234,8 +235,9 @@ static int uwb_lifted(double *fpp1_dbm, double *fpp2_dbm, double *lifted)
 }
 
 /* Correct a range in metres, given the powers of both ends in dBm (0 or NaN: not measured). Returns 0; 1 if the power
-   is outside the fitted ones; 2 if no power was measured (only the delays are corrected, sigma is NaN); -1 for a tag
-   without a delay and for a pair whose correction is not determined (nothing is written). sigma_m may be NULL. */
+   is outside the fitted ones; 2 if no power was measured, but is needed (only the delays are corrected, sigma is NaN);
+   -1 for a tag without a delay and for a pair whose correction is not determined (nothing is written). sigma_m may be
+   NULL. */
 static inline int uwb_correct(double range_m, double fpp1_dbm, double fpp2_dbm, int initiator, int target,
                               double *corrected_m, double *sigma_m)
 {
@@ -256,7 +258,7 @@ static inline int uwb_correct(double range_m, double fpp1_dbm, double fpp2_dbm, 
     *corrected_m -= bias;
     if (sigma_m)
         *sigma_m = UWB_SIGMA(lifted);
-    return lifted < UWB_LOWEST || lifted > UWB_HIGHEST;
+    return UWB_NEEDS_POWER && (lifted < UWB_LOWEST || lifted > UWB_HIGHEST);
 }
 
 /* Add the spherical harmonics at a unit vector, minus their centre, to values. */
@@ -416,7 +418,8 @@ def c_header(calibration: Calibration) -> str:
         f"#define UWB_TAGS {len(tags)}",
         f"#define UWB_ALPHA_DBM {_number(calibration.alpha_dbm)}",
         f"#define UWB_LIFT_OF_MEAN {int(calibration.lift == 'lift-of-mean')}",
-        f"#define UWB_AT_RECEPTIONS {int(calibration.power_at == 'reception')}",
+        f"#define UWB_AT_RECEPTIONS {int(calibration.power_at == 'reception' and calibration.needs_power)}",
+        f"#define UWB_NEEDS_POWER {int(calibration.needs_power)}",
         f"#define UWB_LOWEST {_number(bias.range[0])}",
         f"#define UWB_HIGHEST {_number(bias.range[1])}",
         f"#define UWB_FAINTEST_DBM {_number(FAINTEST_DBM)}",
