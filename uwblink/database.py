@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from uwblink.errors import OutputError, RecordingError, raising
-from uwblink.output import interrupts_held, is_utf8, whole
+from uwblink.output import check_utf8, interrupts_held, whole
 
 with interrupts_held():  # an interrupt within this import ends the process in C++
     import duckdb as duckdb
@@ -83,8 +83,7 @@ def write_tables(table: Path, parquet: Path, rows: Iterable[Mapping[str, Any]], 
 
     The rows can be iterated over more than once; the columns are those of all of them.
     """
-    if not is_utf8(parquet):
-        raise OutputError(f"{parquet}: its name and those of its folders must be UTF-8; give another one")
+    check_utf8(parquet, OutputError)
     with whole(table, force=force) as text, whole(parquet, force=force) as packed:
         columns = dict.fromkeys(key for row in rows for key in row)
         with text.open("w", encoding="utf-8", newline="") as stream:

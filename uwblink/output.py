@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -60,10 +60,11 @@ def write_text(path: Path, text: str, *, force: bool) -> None:
     write_bytes(path, text.encode(errors="backslashreplace"), force=force)
 
 
-def is_utf8(path: Path) -> bool:
-    """Return whether the absolute path of a file is UTF-8, as DuckDB requires."""
+def check_utf8(path: Path, error: Callable[[str], Exception]) -> None:
+    """Raise `error` if the absolute path of a file is not UTF-8, as DuckDB requires."""
     text = str(path.absolute())
-    return text.encode(errors="replace").decode() == text
+    if text.encode(errors="replace").decode() != text:
+        raise error(f"{path}: its name and those of its folders must be UTF-8; give another one")
 
 
 def write_bytes(path: Path, data: bytes, *, force: bool) -> None:

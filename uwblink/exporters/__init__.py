@@ -26,12 +26,11 @@ from uwblink.arrays import Floats, Ints
 from uwblink.database import check_log, connect, log_of, selected
 from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError, raising
 from uwblink.exporters.mcap import write_mcap, write_rosbag2
-from uwblink.output import check_ending, place_beside, take_name
+from uwblink.output import check_ending, check_utf8, place_beside, take_name
 from uwblink.plugins import Registry, check_row
 from uwblink.recording.contents import READING_MB, distances_by_poses_m, pieces
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM
-from uwblink.recording.store import check_name
 
 
 def _write(recording: Path, folder: Path, *, suffix: str, options: str, cells: Mapping[str, str]) -> dict[str, int]:
@@ -178,7 +177,7 @@ def check_export(folder: str | os.PathLike[str], *, to: str, force: bool) -> Non
     final = Path(folder)
     if to not in EXPORTERS:
         raise ArgumentError(f"found {to!r:.40}, allowed: {', '.join(EXPORTERS)}", parameter="to")
-    check_name(final)
+    check_utf8(final, RecordingError)
     check_ending(final)
     if final.name in ("", "..") and final.is_dir():  # a new folder cannot take such a name
         example = final / "tables"

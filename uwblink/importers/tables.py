@@ -33,7 +33,7 @@ from uwblink.database import connect
 from uwblink.errors import ImportTableError, first_line, raising
 from uwblink.importers.column_map import JSON_LINE, ColumnMap
 from uwblink.importers.templates import Template
-from uwblink.output import is_utf8
+from uwblink.output import check_utf8
 from uwblink.text_files import require_regular
 from uwblink.twr import LATEST_NS
 
@@ -171,8 +171,7 @@ def connected(paths: Sequence[Path]) -> Iterator[duckdb.DuckDBPyConnection]:
     It keeps 350 MB in memory and the rest in a temporary folder (`TMPDIR`).
     """
     for path in paths:
-        if not is_utf8(path):
-            raise ImportTableError(f"{path}: its name and those of its folders must be UTF-8; rename it")
+        check_utf8(path, ImportTableError)
     full = raising(
         ImportTableError,
         f"{gettempdir()}: temporary data cannot be written there",

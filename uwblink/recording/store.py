@@ -24,7 +24,7 @@ from uwblink.arrays import Columns
 from uwblink.database import connect, duckdb, log_of
 from uwblink.display import printable
 from uwblink.errors import RecordingError, RecordingInUseError, first_line, raising
-from uwblink.output import is_utf8
+from uwblink.output import check_utf8
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
 
 _UNFIT: Final = (duckdb.DataError, duckdb.InvalidInputException, duckdb.BinderException)
@@ -167,12 +167,6 @@ def _no_recording(path: Path, seen: str) -> RecordingError:
     return RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one ({seen})")
 
 
-def check_name(path: Path) -> None:
-    """Raise `RecordingError` for a path that DuckDB cannot open, one that is not UTF-8."""
-    if not is_utf8(path):
-        raise RecordingError(f"{path}: its name and those of its folders must be UTF-8; give another one")
-
-
 def check_length(path: Path) -> None:
     """Raise `RecordingError` for a truncated file, which DuckDB may still open.
 
@@ -214,7 +208,7 @@ class Store:
 
         A reader that checks a new file locks it for a moment, so the writer waits up to two seconds for the lock.
         """
-        check_name(path)
+        check_utf8(path, RecordingError)
         place = partial or path
         end_s = time.monotonic() + 2.0
         while True:
@@ -237,7 +231,7 @@ class Store:
         Queries and read data use at most `memory_mb` of memory, by default most of the computer's. If the file is
         already open in this program, its first limit remains.
         """
-        check_name(path)
+        check_utf8(path, RecordingError)
         check_length(path)
         size = path.stat().st_size
         try:

@@ -21,7 +21,7 @@ import duckdb
 import uwblink
 from uwblink.database import connect, write_tables
 from uwblink.errors import UwblinkError, first_line, raising
-from uwblink.output import check_folder, is_utf8
+from uwblink.output import check_folder, check_utf8
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.store import check_tables
 from uwbsim.errors import ParameterError, ScenarioError
@@ -194,8 +194,7 @@ class ResultStore:
     @contextmanager
     def open(cls, path: Path, identity: Mapping[str, Any] | None = None) -> Iterator[Self]:
         """Open a store, or make one for the sweep with this identity; raises `TableError` if it is no store."""
-        if not is_utf8(path):
-            raise TableError(f"{path}: its name and those of its folders must be UTF-8; give another one")
+        check_utf8(path, TableError)
         if path.is_symlink():
             raise TableError(f"{path}: is a link; give the folder in which the sweep was started")
         try:
