@@ -30,7 +30,7 @@ from uwblink.importers.column_map import (
 )
 from uwblink.importers.devices import LINES
 from uwblink.importers.plausibility import MIN_ROWS, reason_against_dbm, reason_against_metres
-from uwblink.importers.tables import detect, lacks_header, object_in, open_file, reading
+from uwblink.importers.tables import detect, lacks_header, object_in, opened
 from uwblink.importers.templates import Template
 from uwblink.twr import STAMPS
 
@@ -212,7 +212,7 @@ def form_of(path: Path) -> tuple[ColumnMap, Entries]:
 
 def _log(path: Path) -> tuple[ColumnMap, Entries] | None:
     """Return the form of a log by the templates of its first lines, with a time before them if there is one."""
-    with reading(path), open_file(path) as file:
+    with opened(path) as file:
         # The time of a search grows with the square of a line's length; no board prints 10,000 letters in one.
         lines = [line[:10_000].decode("latin-1").rstrip("\r\n") for line in islice(file, 400)]
     # Boards start to print at different times, and in the middle of lines.

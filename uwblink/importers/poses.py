@@ -32,7 +32,7 @@ from uwblink.importers.bags import open_bag
 from uwblink.importers.column_map import DISTANCE_UNITS, TIME_UNITS, ColumnMap, load_map
 from uwblink.importers.forms import plain_name
 from uwblink.importers.plausibility import other_unit
-from uwblink.importers.tables import check_text, reading
+from uwblink.importers.tables import check_text, opened
 from uwblink.recording.distances import distances_m, find_offset
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import POSE, Poses, Tag, load_places
@@ -84,7 +84,7 @@ def _read(path: Path, body: str | None, topics: Mapping[str, str] | None, stated
     elif topics:
         raise ImportTableError(f"{path}: has no topics, because it is not a bag")
     else:
-        with reading(path), path.open("rb") as raw, TextIOWrapper(raw, "utf-8-sig", newline="") as file:
+        with opened(path) as raw, TextIOWrapper(raw, "utf-8-sig", newline="") as file:
             check_text(path, raw.peek(4096))
             poses, turned = _from_text(path, file, body, stated)
     if not len(poses):

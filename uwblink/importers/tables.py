@@ -23,7 +23,7 @@ from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
-from typing import IO, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import duckdb
 import numpy as np
@@ -44,31 +44,23 @@ MAX_CELLS: Final = 4096
 """Cells of a row; an impulse response in cells of its own takes 2,032."""
 
 
-def open_file(path: Path) -> IO[bytes]:
-    """Open a file, plain or gzipped."""
-    return gzip.open(path) if path.suffix == ".gz" else path.open("rb")  # type: ignore[return-value]  # it reads alike
-
-
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Convert errors of reading a text file into `ImportTableError`."""
+def opened(path: Path) -> Iterator[io.BufferedReader]:
+    """Open a text file, plain or gzipped; raises `ImportTableError` for UTF-16, and if it cannot be read as text."""
     with (
         raising(ImportTableError, f"{path}: not a CSV table", csv.Error),
         raising(ImportTableError, f"{path}: cannot be read", OSError),
         raising(ImportTableError, f"{path}: broken or truncated gzip", gzip.BadGzipFile, EOFError, zlib.error),
         raising(ImportTableError, f"{path}: not a text file in UTF-8", UnicodeDecodeError),
+        gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file,
     ):
-        yield
-
-
-def _refuse_utf16(path: Path, raw: bytes) -> None:
-    if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        raise ImportTableError(f"{path}: is text in UTF-16; save it in UTF-8")
+        if file.peek(2).startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            raise ImportTableError(f"{path}: is text in UTF-16; save it in UTF-8")
+        yield file  # type: ignore[misc]  # both read alike
 
 
 def check_text(path: Path, raw: bytes) -> None:
-    """Raise `ImportTableError` if the first bytes of a table are not text in UTF-8, but UTF-16 or binary."""
-    _refuse_utf16(path, raw)
+    """Raise `ImportTableError` if the first bytes of a table are not text, but binary."""
     if b"\0" in raw:
         raise ImportTableError(f"{path}: not a text file (it contains zero bytes); expected a table in UTF-8")
 
@@ -102,7 +94,7 @@ def detect(path: Path, column_map: ColumnMap) -> Dialect:
     skipped. Raises `ImportTableError` for a file that is not text with a header.
     """
     delimiter, decimal = column_map.delimiter, column_map.decimal
-    with reading(path), open_file(path) as file:
+    with opened(path) as file:
         raw = file.read(65_536)
         check_text(path, raw)
         text, encoding = _decoded(raw)
@@ -152,9 +144,8 @@ def check_lines(path: Path, delimiter: str) -> None:
     DuckDB would store the whole line for each extra cell, and would never finish a broken compressed file.
     """
     line, length, cells = 1, 0, 0
-    with reading(path), open_file(path) as file:
+    with opened(path) as file:
         while piece := file.read(8192):
-            _refuse_utf16(path, piece if line == 1 else b"")
             ends = piece.count(b"\n")
             line += ends
             # Only lines that fill whole pieces are measured, which saves time for short ones.
@@ -327,7 +318,7 @@ class SourceTable:
         """
         check_lines(self.path, "\n")
         fields, each, lists = dict[str, str](), self.column_map.each, dict[str, None]()
-        with reading(self.path), open_file(self.path) as file:
+        with opened(self.path) as file:
             lines = [
                 line.decode("utf-8-sig", "replace" if self.column_map.line else "strict") for line in islice(file, 1000)
             ]
@@ -489,7 +480,7 @@ class SourceTable:
         line = self.column_map.line
         counts = re.compile(Template(line).pattern).search if line else lambda text: text.strip(blank)
         counts = object_in if line == JSON_LINE else counts
-        with io.TextIOWrapper(open_file(self.path), "latin-1" if line else "utf-8-sig", "replace") as file:
+        with opened(self.path) as raw, io.TextIOWrapper(raw, "latin-1" if line else "utf-8-sig", "replace") as file:
             lines = enumerate(file, start=1)
             filled = (n for n, text in lines if n > self._skip and counts(text) and n not in rejected)
             return np.fromiter(filled, np.int64)
