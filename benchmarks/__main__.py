@@ -150,7 +150,7 @@ def loading(folder: Path) -> float:
     columns |= {"time_ns": np.arange(n, dtype=np.int64), "protocol": np.full(n, "ds")}
     path = folder / "million.uwb"
     with Recording.create(path) as recording:
-        recording.append_exchanges(Exchanges(**columns))
+        recording.append("exchanges", Exchanges(**columns))
 
     def read() -> None:
         with Recording.open(path) as recording:

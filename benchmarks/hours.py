@@ -181,7 +181,7 @@ def recording(hours: float, path: Path) -> None:
     record(ports.names, path, plan, duration_s=hours * 3600, using=ports, watch=_Lines(path).watch, force=True)
     with Recording.open(path, update=True, memory_mb=64) as recorded:
         for poses in ports.poses(hours * 3600):
-            recorded.append_poses(poses)
+            recorded.append("poses", poses)
 
 
 class _Lines:

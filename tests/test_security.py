@@ -293,7 +293,7 @@ def test_a_live_recording_goes_through_no_planted_link(tmp_path):
         (tmp_path / name).symlink_to(target)
     secret.write_text(SECRET)
     with uwblink.Recording.create(path, live=True) as recording:
-        recording.append_tags([uwblink.Tag(1, "a", (0.0, 0.0, 0.0))])
+        recording.append("tags", [uwblink.Tag(1, "a", (0.0, 0.0, 0.0))])
         assert secret.read_text() == SECRET
     assert names(tmp_path) == ["live.uwb", "secret.txt"]
     assert (path.is_symlink(), uwblink.load(path).tags[0].body) == (False, "a")
@@ -310,7 +310,7 @@ def test_live_poses_go_through_no_planted_link(tmp_path):
 
 def test_a_log_left_by_the_file_that_is_replaced_goes_with_it(place):
     with uwblink.Recording.create(place / "old.uwb", live=True) as recording:
-        recording.append_tags([uwblink.Tag(7, "old", (0.0, 0.0, 0.0))])
+        recording.append("tags", [uwblink.Tag(7, "old", (0.0, 0.0, 0.0))])
         for suffix in ("uwb", "uwb.wal"):
             shutil.copy(place / f"old.{suffix}", place / f"f.{suffix}")
     succeed("calib", "sample", "-o", place / "f.uwb", "-n", 100, "--force")

@@ -64,7 +64,7 @@ def apply(
     >>> known = calib.fit(flight).calibration
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     with Recording.create(f"{folder}/flight.uwb") as recording:
-    ...         recording.append_exchanges(flight.exchanges)
+    ...         recording.append("exchanges", flight.exchanges)
     ...     calib.apply(f"{folder}/flight.uwb", known, f"{folder}/corrected.uwb").count
     900
     """
@@ -144,7 +144,7 @@ def _append(written: Recording, exchanges: Exchanges, applied: CorrectedRanges) 
         "tail_probability": applied.tail_probability,
     }
     with written.transaction():
-        written.append_exchanges(replace(exchanges, range_m=known.range_m))
+        written.append("exchanges", replace(exchanges, range_m=known.range_m))
         written.append("corrected", table)
     return len(exchanges), int(np.count_nonzero(known.clamped)), int(np.count_nonzero(np.isnan(applied.lifted)))
 

@@ -269,9 +269,9 @@ def test_sigma_is_positive_everywhere(calibration):
 def test_fit_does_not_read_what_was_planted(flights, tmp_path):
     copy = tmp_path / "test1.uwb"
     with Recording.open(flights / "test1.uwb") as source, Recording.create(copy) as target:
-        target.append_tags(source.tags())
-        target.append_poses(source.poses())
-        target.append_exchanges(source.exchanges())
+        target.append("tags", source.tags())
+        target.append("poses", source.poses())
+        target.append("exchanges", source.exchanges())
     run("calib", "fit", copy, "-o", tmp_path / "copy.json")
     run("calib", "fit", flights / "test1.uwb", "-o", tmp_path / "whole.json")
     assert (tmp_path / "copy.json").read_bytes() == (tmp_path / "whole.json").read_bytes()

@@ -123,7 +123,7 @@ def board_ids(recording: Recording) -> dict[str, int]:
 def rewrite(source: Recording, decoded: Decoded, output: Path, *, force: bool = False) -> None:
     """Write a copy of a recording with decoded exchanges; raises what `Recording.create` raises."""
     with source.copying(output, without=("exchanges", "overheard", "cirs"), force=force) as written:
-        written.append_exchanges(decoded.exchanges)
+        written.append("exchanges", decoded.exchanges)
         append_rows(written, decoded.others)
 
 

@@ -290,5 +290,5 @@ def record_printed(
                         watch(seen)
         finally:
             names = {number: name if isinstance(name, str) else f"tag{name}" for name, number in seen.numbers.items()}
-            recording.append_tags(Tag(number, names[number], (0.0, 0.0, 0.0)) for number in sorted(names))
+            recording.append("tags", [Tag(number, names[number], (0.0, 0.0, 0.0)) for number in sorted(names)])
     return seen

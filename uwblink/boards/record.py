@@ -85,7 +85,7 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
         # Without a limit of memory DuckDB would cache the whole file.
         with Recording.create(path, meta=meta, force=force, live=True, memory_mb=64) as recording:
             placed = {tag.tag: tag for tag in plan.tags}
-            recording.append_tags(placed.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
+            recording.append("tags", [placed.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found)])
             with RecordingWriter(recording) as writer:
                 listening = [writer, DelayCheck(delays), *others]
 
@@ -162,7 +162,7 @@ def append_rows(recording: Recording, rows: Sequence[Row]) -> None:
     heard = [(row.time_ns, row.board, row.message) for row in rows if isinstance(row, Heard)]
     recording.append("frames", [row for row in rows if isinstance(row, FrameRow)])
     recording.append("faults", [row for row in rows if isinstance(row, Fault)])
-    recording.append_exchanges(exchanges_of(heard))
+    recording.append("exchanges", exchanges_of(heard))
     recording.append("overheard", [overheard_row(t, board, o) for t, board, o in heard if isinstance(o, Overheard)])
     cirs = [
         CirRow(t, board, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes)

@@ -139,7 +139,7 @@ def import_tables(
             ends = " UNION ".join(f"SELECT {name} AS id FROM {rows.name} WHERE {rows.condition}" for name in ids)
             tags = db.execute(f"{ends} ORDER BY id").fetchall()
             bodies = {tag: staging.names.get(tag, f"tag{tag}") for (tag,) in tags}
-            recording.append_tags(Tag(tag, body, (0.0, 0.0, 0.0)) for tag, body in bodies.items())
+            recording.append("tags", [Tag(tag, body, (0.0, 0.0, 0.0)) for tag, body in bodies.items()])
             for block in rows.blocks():
                 watch("writing", done / total)
                 exchanges = exchanges_of(column_map, block, reading, done)
@@ -152,11 +152,11 @@ def import_tables(
                 if not np.isfinite(exchanges.range_m).all():
                     raw, reported = raw_range(exchanges), exchanges.range_m
                     exchanges = replace(exchanges, range_m=np.where(np.isfinite(reported), reported, raw))
-                recording.append_exchanges(exchanges)
+                recording.append("exchanges", exchanges)
                 for table, beside in _other_rows(exchanges, block):
                     recording.append(table, beside)
             for poses in _poses(rows, bodies):
-                recording.append_poses(poses)
+                recording.append("poses", poses)
             for table, found in staging.beside.items():
                 recording.append(table, found)
             first = ""

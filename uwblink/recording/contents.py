@@ -118,12 +118,10 @@ class Contents:
         """Write a recording; raises the errors of `Recording.create`."""
         meta = {"timestamp_bits": self.exchanges.bits, **self.meta}
         with Recording.create(path, meta=meta, force=force) as recording:
-            recording.append_tags(self.tags)
-            recording.append_poses(self.poses)
             # In blocks, because DuckDB keeps rows in memory until they are committed.
             for start in range(0, len(self.exchanges), 500_000):
-                recording.append_exchanges(self.exchanges[start : start + 500_000])
-            for table in (*_COLUMNS, *_LISTS):
+                recording.append("exchanges", self.exchanges[start : start + 500_000])
+            for table in ("tags", "poses", *_COLUMNS, *_LISTS):
                 recording.append({"known_distances": "distances"}.get(table, table), getattr(self, table))
 
     def __repr__(self) -> str:

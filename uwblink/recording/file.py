@@ -78,8 +78,8 @@ class Recording(Store):
     >>> from uwblink import Exchanges, Recording, Tag
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "mine.uwb"
     >>> with Recording.create(path, meta={"place": "roof"}) as recording:
-    ...     recording.append_tags([Tag(1, "mast", (0.0, 0.0, 2.0)), Tag(2, "drone", (0.1, 0.0, 0.0))])
-    ...     recording.append_exchanges(Exchanges.from_arrays([1], [2], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000]))
+    ...     recording.append("tags", [Tag(1, "mast", (0.0, 0.0, 2.0)), Tag(2, "drone", (0.1, 0.0, 0.0))])
+    ...     recording.append("exchanges", Exchanges.from_arrays([1], [2], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000]))
     >>> with Recording.open(path) as recording:
     ...     print(recording.show())
     mine.uwb: 1 exchanges in 0.0 s, protocols ss 1
@@ -274,27 +274,15 @@ class Recording(Store):
             self._execute("DELETE FROM meta WHERE key = ?", [key])
             self._execute("INSERT INTO meta VALUES (?, ?)", [key, text])
 
-    def append_tags(self, tags: Iterable[Tag]) -> None:
-        """Add tags with their bodies and lever arms."""
-        self.append("tags", tags)
-
-    def append_exchanges(self, exchanges: Exchanges) -> None:
-        """Add exchanges, in one transaction."""
-        self.append("exchanges", exchanges)
-
-    def append_poses(self, poses: Poses) -> None:
-        """Add poses, in one transaction."""
-        self.append("poses", poses)
-
     def replace_poses(self, poses: Poses, meta: Mapping[str, Any], tags: Iterable[Tag] | None = None) -> None:
         """Replace the poses, and the tags if given, and add entries to `meta`, in one transaction."""
         with self.transaction():
             self._execute("DELETE FROM poses")
-            self.append_poses(poses)
+            self.append("poses", poses)
             self.append_meta(meta)
             if tags is not None:
                 self._execute("DELETE FROM tags")
-                self.append_tags(tags)
+                self.append("tags", tags)
 
     def meta(self) -> dict[str, Any]:
         """Return all entries of `meta`, decoded."""

@@ -241,8 +241,8 @@ class Twin:
         if self.paths:
             poses = path.with_suffix(".poses.uwb")
             with Recording.create(poses, meta={"source": "uwbsim twin"}, force=force) as recording:
-                recording.append_tags([Tag(tag.id, tag.body, tag.lever_arm_m) for tag in self.scenario.tags])
-                recording.append_poses(Poses.concatenate(list(self.paths.values())).in_time_order())
+                recording.append("tags", [Tag(tag.id, tag.body, tag.lever_arm_m) for tag in self.scenario.tags])
+                recording.append("poses", Poses.concatenate(list(self.paths.values())).in_time_order())
             motions = {name: {"model": "recorded", "file": poses.name, "body": name} for name in self.paths}
             table["bodies"] = [body | {"motion": motions.get(body["name"], body["motion"])} for body in table["bodies"]]
         if "plan" in table["ranging"]:

@@ -210,7 +210,7 @@ def test_bodies_with_one_pose_do_not_split_reading(tmp_path):
     names, places = [f"anchor{k}" for k in range(100)], np.ones((100, 3))
     anchors = uwblink.Poses.from_arrays(np.full(100, flight.poses.time_ns[0]), np.array(names), places)
     with uwblink.Recording.open(written(tmp_path / "it.uwb", flight, {}), update=True) as recording:
-        recording.append_poses(anchors)
+        recording.append("poses", anchors)
         assert [len(part) for part, _ in exchanges_with_poses(recording)] == [3000]
 
 

@@ -54,7 +54,7 @@ def test_trajectories(tmp_path):
     time = [1_706_822_508_042_560_815, -1_500_000_000, -250_000_000, 750_000_000]
     poses = Poses.from_arrays(time, ["a/b", "c", "c", "c"], [[1.5, -2.0, 0.1]] * 4, [[0.0, 0.0, 0.6, 0.8]] * 4)
     with Recording.create(tmp_path / "r.uwb") as recording:
-        recording.append_poses(poses)
+        recording.append("poses", poses)
     assert export_recording(tmp_path / "r.uwb", tmp_path / "tum", to="tum") == {"a_b.tum": 1, "c.tum": 3}
     one, other = ((tmp_path / "tum" / name).read_text() for name in ("a_b.tum", "c.tum"))
     assert one == "1706822508.042560815 1.5 -2.0 0.1 0.0 0.0 0.6 0.8\n"

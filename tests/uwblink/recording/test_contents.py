@@ -68,9 +68,9 @@ def full(tmp_path_factory):
     """A recording with rows in every table, not in order of time, and with missing values as in edited files."""
     path = tmp_path_factory.mktemp("full") / "full.uwb"
     with Recording.create(path, meta={"seed": 7, "planted": {"a": [1.5]}}) as r:
-        r.append_exchanges(random_exchanges())
-        r.append_tags([Tag(3, "b", (0.1, 0.2, 0.3)), Tag(1, "a", (0, 0, 0))])
-        r.append_poses(Poses(np.array([6, 5]), np.array(["a", "b"]), np.ones((2, 3)), np.zeros((2, 4))))
+        r.append("exchanges", random_exchanges())
+        r.append("tags", [Tag(3, "b", (0.1, 0.2, 0.3)), Tag(1, "a", (0, 0, 0))])
+        r.append("poses", Poses(np.array([6, 5]), np.array(["a", "b"]), np.ones((2, 3)), np.zeros((2, 4))))
         r.append("overheard", [HEARD, HEARD | {"time_ns": 1, "fpp3_dbm": np.nan, "skew3_ppm": np.nan}])
         r.append("cirs", CIRS)
         r.append("frames", [FrameRow(9, "1", "in", bytes(range(256))), FrameRow(8, "2", "out", b"C01\r")])
@@ -376,8 +376,8 @@ def test_positions_in_gaps_of_poses_are_unknown(step_m, stands):
 @pytest.fixture
 def summary(tmp_path):
     with uwblink.Recording.create(tmp_path / "f.uwb", meta={"note": "[bold]x[/] \x1b[31m", "scenario": "long"}) as r:
-        r.append_exchanges(random_exchanges(50))
-        r.append_tags([uwblink.Tag(3, "b", (0.1, 0.2, 0.3))])
+        r.append("exchanges", random_exchanges(50))
+        r.append("tags", [uwblink.Tag(3, "b", (0.1, 0.2, 0.3))])
         r.append("faults", [Fault(9, "1", "time-out", "no answer"), Fault(10, "1", "time-out", "")])
     with uwblink.Recording.open(tmp_path / "f.uwb") as r:
         return r.show()

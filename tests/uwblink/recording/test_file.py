@@ -36,9 +36,9 @@ def random_exchanges(n=50, seed=1):
 def written(tmp_path_factory):
     path = tmp_path_factory.mktemp("written") / "flight.uwb"
     with Recording.create(path, meta={"seed": 7}) as r:
-        r.append_exchanges(random_exchanges())
-        r.append_tags([Tag(3, "b", (0.1, 0.2, 0.3)), Tag(1, "a", (0, 0, 0))])
-        r.append_poses(Poses(np.array([5, 6]), np.array(["a", "b"]), np.ones((2, 3)), np.zeros((2, 4))))
+        r.append("exchanges", random_exchanges())
+        r.append("tags", [Tag(3, "b", (0.1, 0.2, 0.3)), Tag(1, "a", (0, 0, 0))])
+        r.append("poses", Poses(np.array([5, 6]), np.array(["a", "b"]), np.ones((2, 3)), np.zeros((2, 4))))
         r.append("faults", [Fault(9, "1", "time-out", "no answer")])
     return path
 
@@ -70,7 +70,7 @@ def test_an_existing_file_is_not_replaced_without_force(recording, tmp_path):
 
 def test_a_failed_block_leaves_no_file(tmp_path):
     with pytest.raises(RuntimeError, match="midway"), Recording.create(tmp_path / "x.uwb") as r:
-        r.append_exchanges(random_exchanges())
+        r.append("exchanges", random_exchanges())
         raise RuntimeError("midway")
     assert list(tmp_path.iterdir()) == []
 
@@ -168,18 +168,18 @@ def test_recordings_that_are_being_written_are_named(tmp_path):
     ("write", "expected"),
     [
         (
-            lambda r: r.append_exchanges(replace(random_exchanges(), initiator=np.full(50, 70_000))),
+            lambda r: r.append("exchanges", replace(random_exchanges(), initiator=np.full(50, 70_000))),
             "table exchanges: values that do not fit",
         ),
         (
-            lambda r: r.append_exchanges(replace(random_exchanges(), tx1=np.full(50, "early"))),
+            lambda r: r.append("exchanges", replace(random_exchanges(), tx1=np.full(50, "early"))),
             "table exchanges: values that do not fit",
         ),
         (
-            lambda r: r.append_exchanges(replace(random_exchanges(), range_m=np.ones(3))),
+            lambda r: r.append("exchanges", replace(random_exchanges(), range_m=np.ones(3))),
             "table exchanges: columns of different lengths",
         ),
-        (lambda r: r.append_tags([Tag(-1, "a", (0, 0, 0))]), "table tags: values that do not fit"),
+        (lambda r: r.append("tags", [Tag(-1, "a", (0, 0, 0))]), "table tags: values that do not fit"),
         (lambda r: r.append("cirs", [CirRow(1, 1, 1, 2, 0.0, (70_000,))]), "table cirs: values that do not fit"),
         (lambda r: r.append_meta({"bad": float("nan")}), "meta 'bad': cannot be stored as JSON"),
         (lambda r: r.append_meta({"bad": {1, 2}}), "meta 'bad': cannot be stored as JSON"),
@@ -187,12 +187,12 @@ def test_recordings_that_are_being_written_are_named(tmp_path):
 )
 def test_values_that_do_not_fit_undo_their_transaction(tmp_path, write, expected):
     with Recording.create(tmp_path / "f.uwb", live=True) as r:
-        r.append_exchanges(random_exchanges(7))
+        r.append("exchanges", random_exchanges(7))
         with pytest.raises(errors.RecordingError, match=one_line(expected)), r.transaction():
-            r.append_exchanges(random_exchanges(5))
+            r.append("exchanges", random_exchanges(5))
             write(r)
         assert r.count("exchanges") == 7
-        r.append_exchanges(random_exchanges(2))
+        r.append("exchanges", random_exchanges(2))
     assert len(load(tmp_path / "f.uwb").exchanges) == 9
 
 
