@@ -183,38 +183,19 @@ class Recording(Store):
         """Return the summary of the recording, which has a text form."""
         return summarize(self)
 
-    def copy(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        replacing: Mapping[str, Any] | None = None,
-        meta: Mapping[str, Any] | None = None,
-        force: bool = False,
-    ) -> None:
-        """Write a copy of this recording to `path`, with all rows of all tables in their order, except those replaced.
-
-        `replacing` maps names of `TABLES` to new contents, in the form in which they are read (`{"exchanges":
-        corrected}`; an empty list for an empty table). `meta` are entries to add or to replace. Raises the errors of
-        `create`, and `RecordingError` for an unknown table.
-        """
-        instead = dict(replacing or {})
-        entries = dict(instead.get("meta", {})) | dict(meta or {})
-        with self.copying(path, without=instead, meta=entries, force=force) as written:
-            for table in instead.keys() - {"meta"}:
-                written.append(table, instead[table])
-
     @contextmanager
     def copying(
         self,
         path: str | os.PathLike[str],
         *,
-        without: Collection[str],
+        without: Collection[str] = (),
         meta: Mapping[str, Any] | None = None,
         force: bool = False,
     ) -> Iterator[Self]:
-        """Yield a copy of all tables except those in `without`, which the block appends, also in parts.
+        """Yield a copy of this recording at `path`, with all rows of all tables in their order.
 
-        Raises the errors of `copy`.
+        Tables in `without` are left out; the block can append their new rows, also in parts. `meta` are entries to add
+        or to replace. Raises the errors of `create`, and `RecordingError` for an unknown table.
         """
         known_tables(without)
         entries = {} if "meta" in without else self.meta()

@@ -108,7 +108,8 @@ def test_a_recording_from_before_faults_named_their_exchange_is_read(recording, 
     first, later = Fault(9, "1", "time-out", "no answer", None, None), Fault(10, "1", "time-out", "no answer", 1, 2)
     with Recording.open(recording) as r:
         assert r.faults() == [first]
-        r.copy(tmp_path / "copy.uwb")
+        with r.copying(tmp_path / "copy.uwb"):
+            pass
     with Recording.open(recording, update=True) as r:
         r.append("faults", [later])
     assert [load(path).faults for path in (tmp_path / "copy.uwb", recording)] == [[first], [first, later]]
@@ -211,8 +212,8 @@ def test_tables_that_came_later_are_empty(older):
 
 
 def test_an_older_file_is_copied_and_added_to(older, tmp_path):
-    with Recording.open(older) as recording:
-        recording.copy(tmp_path / "copy.uwb")
+    with Recording.open(older) as recording, recording.copying(tmp_path / "copy.uwb"):
+        pass
     height = {"time_ns": np.array([5]), "body": np.array(["drone"]), "height_m": np.array([0.25])}
     with Recording.open(older, update=True) as recording:
         recording.append("height", height)
