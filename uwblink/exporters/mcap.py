@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 from heapq import merge
@@ -23,7 +23,6 @@ from typing import Any, Final
 import numpy as np
 from mcap.writer import Writer
 
-from uwblink.arrays import Floats
 from uwblink.errors import RecordingError, raising
 from uwblink.recording.contents import READING_MB, Contents, distances_by_poses_m, pieces
 from uwblink.recording.file import Recording
@@ -42,7 +41,10 @@ READINGS: Final = {
 """Tables of readings: the column of the body or tag, and the columns of values."""
 
 TimedRow = tuple[int, str, Any, Any]
-"""Time in nanoseconds, table, body, tag or pair, and values; the index of a range, the fault itself."""
+"""Time in nanoseconds, table, body, tag or pair, and values; the range and its content, the fault itself."""
+
+Encoded = list[tuple[str, str, Any]]
+"""Topic, type and content of messages."""
 
 
 _MEASURED: Final = ("range_m", "truth_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
@@ -85,16 +87,19 @@ def stamped(time_ns: int, content: dict[str, Any]) -> dict[str, Any]:
     return {"timestamp": {"sec": sec, "nsec": nsec}} | content
 
 
-def timed_rows(held: Contents) -> Iterator[TimedRow]:
+def timed_rows(recording: Recording, held: Contents) -> Iterator[TimedRow]:
     """Yield poses, ranges, readings and faults of a piece of a recording in order of time."""
-    poses, e = held.poses, held.exchanges
+    poses, e, content = held.poses, held.exchanges, _ranges(recording, held)
     columns = (poses.time_ns, poses.body, poses.position_m, poses.quaternion)
     posed = zip(*(column.tolist() for column in columns), strict=True)
     order = np.argsort(e.time_ns, kind="stable")
     ends = zip(e.initiator[order].tolist(), e.target[order].tolist(), strict=True)
     parts: list[Iterator[TimedRow]] = [
         ((time_ns, "poses", body, place) for time_ns, body, *place in posed),
-        ((t, "ranges", of, k) for t, of, k in zip(e.time_ns[order].tolist(), ends, order.tolist(), strict=True)),
+        (
+            (t, "ranges", of, (float(e.range_m[k]), content(k)))
+            for t, of, k in zip(e.time_ns[order].tolist(), ends, order.tolist(), strict=True)
+        ),
     ]
     parts += [_readings(table, getattr(held, table)) for table in READINGS]
     parts.append((f.time_ns, "faults", f.board, f) for f in sorted(held.faults, key=lambda fault: fault.time_ns))
@@ -106,29 +111,28 @@ def _readings(table: str, columns: Any) -> Iterator[TimedRow]:
     return ((time_ns, table, whose, values) for time_ns, whose, *values in rows)
 
 
-Message = tuple[int, str, str, Any]
-"""Time in nanoseconds, topic, type, and content."""
-
-
 def _write(
     recording: Path,
     form: str,
-    encode: Callable[[Recording, Contents], Iterable[Message]],
+    encode: Callable[[int, str, Any, Any], Encoded],
     publish: Callable[[int, str, str, Any], object],
 ) -> int:
-    """Publish all messages of a recording in order of time; returns their number.
+    """Publish the messages of all rows of a recording in order of time; returns their number.
+
+    `encode` takes a row as `timed_rows` yields it, `publish` time, topic, type and content of a message.
 
     Raises `RecordingError` for times before 1970 and for values that the form cannot represent.
     """
     count = 0
     with Recording.open(recording, memory_mb=READING_MB) as opened:
-        for time_ns, topic, kind, content in (row for held in pieces(opened) for row in encode(opened, held)):
-            if time_ns < 0:
+        for row in (row for held in pieces(opened) for row in timed_rows(opened, held)):
+            if row[0] < 0:
                 raise RecordingError(f"{recording}: has times before 1970, which {form} cannot hold")
-            wrong = f"{recording}: {topic}: has a number that is not finite or too large, which {form} cannot represent"
-            with raising(RecordingError, wrong, ValueError, OverflowError):
-                publish(time_ns, topic, kind, content)
-            count += 1
+            for topic, kind, content in encode(*row):
+                wrong = f"{recording}: {topic}: has a number that is not finite or too large"
+                with raising(RecordingError, f"{wrong}, which {form} cannot represent", ValueError, OverflowError):
+                    publish(row[0], topic, kind, content)
+                count += 1
     return count
 
 
@@ -147,22 +151,14 @@ def write_mcap(recording: Path, folder: Path) -> dict[str, int]:
             data = json.dumps(stamped(time_ns, content), allow_nan=False).encode()
             writer.add_message(channel(topic, schema), time_ns, data, time_ns)
 
-        count = _write(recording, "JSON in MCAP", _messages, publish)
+        count = _write(recording, "JSON in MCAP", lambda _, table, *row: _ENCODERS[table](*row), publish)
         writer.finish()  # type: ignore[no-untyped-call]  # the library does not say what it returns
     return {"recording.mcap": count}
 
 
-def _messages(recording: Recording, held: Contents) -> Iterator[Message]:
-    """Yield the JSON messages of a piece of a recording; their types are names of `SCHEMAS`."""
-    (by_poses,) = distances_by_poses_m(recording, [held.exchanges])
-    ranges = _ranges(held, by_poses)
-    for time_ns, table, whose, values in timed_rows(held):
-        for message in _ENCODERS[table](whose, ranges(values) if table == "ranges" else values):
-            yield time_ns, *message
-
-
-def _ranges(held: Contents, by_poses: Floats) -> Callable[[int], dict[str, Any]]:
+def _ranges(recording: Recording, held: Contents) -> Callable[[int], dict[str, Any]]:
     """Return a function for the content of a range, with `corrected_m` and so on if ranges were corrected."""
+    (by_poses,) = distances_by_poses_m(recording, [held.exchanges])
     e = replace(held.exchanges, truth_m=np.where(np.isfinite(held.exchanges.truth_m), held.exchanges.truth_m, by_poses))
     columns = {name: getattr(e, name).tolist() for name in ("initiator", "target", "protocol", *_MEASURED)}
     if held.corrected:  # with the rows of the exchanges
@@ -178,9 +174,6 @@ def _known(row: dict[str, Any]) -> dict[str, Any]:
 
 def _vector(values: list[float]) -> dict[str, float]:
     return dict(zip("xyzw", values, strict=False))
-
-
-Encoded = list[tuple[str, str, dict[str, Any]]]
 
 
 def _of_pose(body: str, values: Any) -> Encoded:
@@ -202,7 +195,7 @@ def _of_fault(board: str, fault: Any) -> Encoded:
 
 _ENCODERS: Final[dict[str, Callable[[Any, Any], Encoded]]] = {
     "poses": _of_pose,
-    "ranges": lambda ends, row: [(f"/ranges/{ends[0]}_{ends[1]}", RANGE, row)],
+    "ranges": lambda ends, values: [(f"/ranges/{ends[0]}_{ends[1]}", RANGE, values[1])],
     "imu": _of_imu,
     "height": lambda body, values: [(f"/height/{body}", "uwb.Height", _known({"height_m": values[0]}))],
     "temperature": lambda tag, values: [
@@ -210,6 +203,7 @@ _ENCODERS: Final[dict[str, Callable[[Any, Any], Encoded]]] = {
     ],
     "faults": _of_fault,
 }
+"""The JSON messages of a row by its table; their types are names of `SCHEMAS`."""
 
 
 def write_rosbag2(recording: Path, folder: Path) -> dict[str, int]:
@@ -227,7 +221,7 @@ def write_rosbag2(recording: Path, folder: Path) -> dict[str, int]:
         def publish(time_ns: int, topic: str, kind: str, message: Any) -> None:
             bag.write(connection(topic, kind), time_ns, store.serialize_cdr(message, kind))
 
-        return {"rosbag2": _write(recording, "bags", _RosMessages(store.types).all, publish)}
+        return {"rosbag2": _write(recording, "bags", _RosMessages(store.types).encode, publish)}
 
 
 def topic_name(text: str) -> str:
@@ -242,17 +236,11 @@ class _RosMessages:
     def __init__(self, types: Any) -> None:
         self._types = types
 
-    def all(self, recording: Recording, held: Contents) -> Iterator[Message]:
-        """Yield the messages of a piece of a recording, in order of time."""
-        ranges, variances = held.exchanges.range_m, _variances(held)
-        (by_poses,) = distances_by_poses_m(recording, [held.exchanges])
-        rows = _ranges(held, by_poses)
+    def encode(self, time_ns: int, table: str, whose: Any, values: Any) -> Encoded:
+        """Return the messages of a row."""
         encoders: dict[str, Callable[[Any, Any, Any], list[tuple[str, Any]]]] = {
             "poses": self._poses,
-            "ranges": lambda stamp, ends, k: [
-                (f"/uwb/range_{ends[0]}_{ends[1]}", self._range(stamp, f"uwb_{ends[0]}", ranges[k], variances[k])),
-                (EXCHANGES, self._new("std_msgs/String", json.dumps(rows(k)))),
-            ],
+            "ranges": self._ranges,
             "imu": self._imu,
             "height": lambda stamp, body, values: [
                 (f"/height/{topic_name(body)}", self._range(stamp, body, values[0], 0.0))
@@ -270,10 +258,8 @@ class _RosMessages:
                 )
             ],
         }
-        for time_ns, table, whose, values in timed_rows(held):
-            stamp = self._new("builtin_interfaces/Time", *divmod(time_ns, 1_000_000_000))
-            for topic, message in encoders[table](stamp, whose, values):
-                yield time_ns, topic, message.__msgtype__, message
+        stamp = self._new("builtin_interfaces/Time", *divmod(time_ns, 1_000_000_000))
+        return [(topic, message.__msgtype__, message) for topic, message in encoders[table](stamp, whose, values)]
 
     def _new(self, kind: str, *values: Any) -> Any:
         package, name = kind.split("/")
@@ -293,10 +279,19 @@ class _RosMessages:
             ("/tf", self._new("tf2_msgs/TFMessage", [transform])),
         ]
 
+    def _ranges(self, stamp: Any, ends: tuple[int, int], values: tuple[float, dict[str, Any]]) -> list[tuple[str, Any]]:
+        range_m, content = values
+        # With reflections where that is known; 0 where nothing is.
+        sigma_m = content.get("sigma_total_m", content.get("sigma_m", 0.0))
+        return [
+            (f"/uwb/range_{ends[0]}_{ends[1]}", self._range(stamp, f"uwb_{ends[0]}", range_m, sigma_m**2)),
+            (EXCHANGES, self._new("std_msgs/String", json.dumps(content))),
+        ]
+
     def _range(self, stamp: Any, frame: str, range_m: float, variance: float) -> Any:
         # A field of view all round, and the 300 m that DW1000 boards reach in the open.
         limits, header = (2 * np.pi, 0.0, 300.0), self._header(stamp, frame)
-        return self._new("sensor_msgs/Range", header, 0, *limits, float(range_m), float(variance))
+        return self._new("sensor_msgs/Range", header, 0, *limits, range_m, variance)
 
     def _imu(self, stamp: Any, body: str, values: list[float]) -> list[tuple[str, Any]]:
         turn, pull = (self._new("geometry_msgs/Vector3", *part) for part in (values[:3], values[3:]))
@@ -304,11 +299,3 @@ class _RosMessages:
         # -1 stands first in the covariance of what an Imu does not measure, by the definition of the message.
         readings = (level, np.array([-1.0] + [0.0] * 8), turn, unknown, pull, unknown)
         return [(f"/imu/{topic_name(body)}", self._new("sensor_msgs/Imu", self._header(stamp, body), *readings))]
-
-
-def _variances(held: Contents) -> Floats:
-    """Return the variances of ranges (n,), reflections counted in where that is known; 0 where nothing is."""
-    if not held.corrected:
-        return np.zeros(len(held.exchanges))
-    total, noise = held.corrected["sigma_total_m"], held.corrected["sigma_m"]
-    return np.asarray(np.nan_to_num(np.where(np.isfinite(total), total, noise) ** 2))
