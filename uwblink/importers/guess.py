@@ -25,7 +25,7 @@ import numpy as np
 
 from uwblink.arrays import Columns, Floats
 from uwblink.display import first_few
-from uwblink.errors import ImportTableError, raising
+from uwblink.errors import ImportTableError, raising, restating
 from uwblink.importers.bags import Bag, fields_of, is_bag, matching_topics, open_bag
 from uwblink.importers.column_map import (
     ALL_IDS,
@@ -222,8 +222,7 @@ def _map_of_connected_table(
     if "message" in columns:
         number = {"message": message_number(table.text(columns["message"]))}
         cells |= {columns["message"]: np.ma.filled(table.read(number, "LIMIT 100000")["message"], np.nan)}
-    names = table.names
-    return _proposal(path, form, top, given, columns, cells, names)
+    return _proposal(path, form, top, given, columns, cells, table.names)
 
 
 def _numbered(path: Path, table: SourceTable) -> Guess:
@@ -265,7 +264,8 @@ def _proposal(
     top |= {} if layout == "nothing" else {"layout": (layout, why)}
     units, undelayed = units_of(form, columns, cells), False
     if layout not in ("ranges", "differences", "nothing"):
-        counter, unit, undelayed = (_exchange_stamps if layout == "exchanges" else _message_stamps)(columns, cells)
+        with restating(ImportTableError, ImportTableError, where=f"{path}: "):
+            counter, unit, undelayed = (_exchange_stamps if layout == "exchanges" else _message_stamps)(columns, cells)
         top, units = top | counter, {"stamps": unit, **units}
     if missing:
         shares = ", ".join(f"{share:.1%} are {value:.10g}" for value, share in missing.items())
@@ -297,18 +297,15 @@ def _proposal(
         f"a column of numbers is still needed: {', '.join(lacking)}": lacking,
     }
     text = _text(path, sections, [text for text, is_due in remarks.items() if is_due])
-    asked = (name for title in ("constants", "", "columns", "units") for name in _asked(sections[title]))
-    return Guess(text, layout != "nothing" and not lacking, tuple(asked), tuple(columns))
+    entries = (entry for title in ("constants", "", "columns", "units") for entry in sections[title].items())
+    asked = tuple(name for name, (value, _) in entries if value == ASKED)
+    return Guess(text, layout != "nothing" and not lacking, asked, tuple(columns))
 
 
 _NO_DELAYS: Final[Entries] = {
     "tx": (0, "according to the true distances, none were programmed into the devices"),
     "rx": (0, ""),
 }
-
-
-def _asked(entries: Entries) -> list[str]:
-    return [name for name, (value, _) in entries.items() if value == ASKED]
 
 
 def _constants(layout: str, columns: Mapping[str, str]) -> Entries:

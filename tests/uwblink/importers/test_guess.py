@@ -24,6 +24,7 @@ from uwblink import errors, import_recording, load
 from uwblink.importers.column_map import load_map
 from uwblink.importers.guess import guess_map
 from uwblink.ticks import TICKS_PER_SECOND
+from uwblink.twr import STAMPS
 
 POLL = ("poll_tx", "poll_rx", "resp_tx", "resp_rx", "final_tx", "final_rx")
 
@@ -285,6 +286,12 @@ def test_missing_columns_are_named_and_not_invented(tmp_path, rows, complete, as
     guess = guess_map(write(tmp_path / "t.csv", rows))
     assert (guess.complete, guess.asked) == (complete, asked)
     assert said in guess.text
+
+
+def test_stamps_that_are_no_numbers_are_refused_with_the_file(tmp_path):
+    write(tmp_path / "s.csv", [dict(zip(["from_id", "to_id", *STAMPS[:4]], [1, 2, *"abcd"], strict=True))])
+    with pytest.raises(errors.ImportTableError, match=r"s\.csv: its stamps are no numbers"):
+        guess_map(tmp_path / "s.csv")
 
 
 def test_third_stamps_of_the_initiator_in_exchanged_columns_are_not_those_of_the_target(tmp_path):
