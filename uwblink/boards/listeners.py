@@ -110,9 +110,6 @@ class Listener:
     def check(self) -> None:
         """Raise an exception to end the recording; called often."""
 
-    def close(self) -> None:
-        """End; no other method is called afterwards."""
-
 
 class CallbackListener(Listener):
     """Calls a function with every message of boards."""

@@ -147,7 +147,7 @@ class Recorder(Closing):
         self.progress.time_s = self._ports.now_s() - self._start_s
 
     def close(self) -> None:
-        """Stop the boards' listening and close the ports; the caller closes the listeners."""
+        """Stop the boards' listening and close the ports."""
         for station in self._stations.values():
             if station.port is None:
                 continue
