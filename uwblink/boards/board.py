@@ -105,10 +105,6 @@ class Connection:
         """Return the time to wait until the board may get the next command."""
         return max(self._quiet_until_s - now_s, 0.0)
 
-    def keep_quiet(self, until_s: float) -> None:
-        """Send no command before a given time, because the board is printing an impulse response."""
-        self._quiet_until_s = max(self._quiet_until_s, until_s)
-
     def deadline_s(self) -> float | None:
         """Return the time at which the outstanding command times out, None without one."""
         return self._pending.until_s if self._pending else None
@@ -127,7 +123,7 @@ class Connection:
         events, outcome = self.decoder.feed(data), None
         # The pieces of an impulse response arrive a millisecond apart, and a target's report 3 ms after it.
         if data and (self.decoder.begun == Cir.KEY or any(isinstance(event, Cir) for event in events)):
-            self.keep_quiet(now_s + 0.005)
+            self._quiet_until_s = max(self._quiet_until_s, now_s + 0.005)
         if self._pending:
             self._pending.heard = (self._pending.heard + data)[-60:]
         for event in events:
@@ -168,7 +164,7 @@ class Connection:
             if event.neighbour != command.target or (command.double_sided and event.tx3 == 0):
                 return None  # a late report of another command
             if command.get_cir:
-                self.keep_quiet(now_s + QUIET_AFTER_CIR_S)
+                self._quiet_until_s = now_s + QUIET_AFTER_CIR_S
         self._pending = None
         if isinstance(event, IdleSet):
             self.doubtful = False

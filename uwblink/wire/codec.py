@@ -110,7 +110,7 @@ class Decoder:
             return []
         self.skipped_bytes += len(data)
         self._before = (self._before + data)[-len(self._terminator) :]
-        return [Skipped(data, "not a message")]
+        return [Skipped(data)]
 
     def _clean(self, skipped: bytes) -> bool:
         """Whether a line ends with the last of these skipped bytes, which may contain a part of the line end."""

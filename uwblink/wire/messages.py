@@ -302,10 +302,9 @@ class TextLine:
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """Bytes that are no message, and the reason."""
+    """Bytes that are no message."""
 
     data: bytes
-    reason: str
 
 
 COMMANDS: Final[dict[bytes, type[Message]]] = {
