@@ -17,12 +17,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 from heapq import merge
+from itertools import tee
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from mcap.writer import Writer
 
+from uwblink.arrays import Floats
 from uwblink.errors import RecordingError, raising
 from uwblink.recording.contents import READING_MB, Contents, distances_by_poses_m, pieces
 from uwblink.recording.file import Recording
@@ -87,9 +89,12 @@ def stamped(time_ns: int, content: dict[str, Any]) -> dict[str, Any]:
     return {"timestamp": {"sec": sec, "nsec": nsec}} | content
 
 
-def timed_rows(recording: Recording, held: Contents) -> Iterator[TimedRow]:
-    """Yield poses, ranges, readings and faults of a piece of a recording in order of time."""
-    poses, e, content = held.poses, held.exchanges, _ranges(recording, held)
+def timed_rows(held: Contents, by_poses: Floats) -> Iterator[TimedRow]:
+    """Yield poses, ranges, readings and faults of a piece of a recording in order of time.
+
+    `by_poses` are the distances (n,) of the exchanges by poses.
+    """
+    poses, e, content = held.poses, held.exchanges, _ranges(held, by_poses)
     columns = (poses.time_ns, poses.body, poses.position_m, poses.quaternion)
     posed = zip(*(column.tolist() for column in columns), strict=True)
     order = np.argsort(e.time_ns, kind="stable")
@@ -125,7 +130,9 @@ def _write(
     """
     count = 0
     with Recording.open(recording, memory_mb=READING_MB) as opened:
-        for row in (row for held in pieces(opened) for row in timed_rows(opened, held)):
+        held, same = tee(pieces(opened))
+        by_poses = distances_by_poses_m(opened, (one.exchanges for one in same))
+        for row in (row for piece in zip(held, by_poses, strict=True) for row in timed_rows(*piece)):
             if row[0] < 0:
                 raise RecordingError(f"{recording}: has times before 1970, which {form} cannot hold")
             for topic, kind, content in encode(*row):
@@ -156,9 +163,8 @@ def write_mcap(recording: Path, folder: Path) -> dict[str, int]:
     return {"recording.mcap": count}
 
 
-def _ranges(recording: Recording, held: Contents) -> Callable[[int], dict[str, Any]]:
+def _ranges(held: Contents, by_poses: Floats) -> Callable[[int], dict[str, Any]]:
     """Return a function for the content of a range, with `corrected_m` and so on if ranges were corrected."""
-    (by_poses,) = distances_by_poses_m(recording, [held.exchanges])
     e = replace(held.exchanges, truth_m=np.where(np.isfinite(held.exchanges.truth_m), held.exchanges.truth_m, by_poses))
     columns = {name: getattr(e, name).tolist() for name in ("initiator", "target", "protocol", *_MEASURED)}
     if held.corrected:  # with the rows of the exchanges
