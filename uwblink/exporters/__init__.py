@@ -23,7 +23,7 @@ import duckdb
 import numpy as np
 
 from uwblink.arrays import Floats, Ints
-from uwblink.database import check_log, connect, log_of, selected
+from uwblink.database import connect, log_of, selected
 from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError, raising
 from uwblink.exporters.mcap import write_mcap, write_rosbag2
 from uwblink.output import check_ending, check_utf8, place_beside, take_name
@@ -42,7 +42,6 @@ def _write(recording: Path, folder: Path, *, suffix: str, options: str, cells: M
     wanted = {table: folder / f"{table}.{suffix}" for table in TABLES if counts[table] or table == "exchanges"}
     # The log is beside the file, not beside a link to it.
     place = recording.resolve()
-    check_log(place)
     with (
         raising(RecordingError, f"{recording}: cannot be exported", duckdb.Error),
         # Several threads buffer rows to keep their order. One takes no more processor time, and 0.29 GB instead of

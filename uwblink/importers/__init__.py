@@ -28,7 +28,7 @@ from uwblink.importers.exchange_tables import TABLE_SUFFIXES, Imported, find_tab
 from uwblink.importers.guess import guess_map
 from uwblink.importers.miluv import read_miluv
 from uwblink.importers.poses import add_poses, pose_topics
-from uwblink.importers.staging import Watch, unwatched
+from uwblink.importers.staging import Watch
 from uwblink.importers.tables import connected
 from uwblink.output import check_output
 from uwblink.plugins import Registry, check_row, is_text
@@ -237,7 +237,7 @@ def import_file(
     importer: str | None = None,
     map_file: MapSource | None = None,
     force: bool = False,
-    watch: Watch = unwatched,
+    watch: Watch = lambda _step, _share: None,
 ) -> Imported:
     """Import like `import_recording`; returns the numbers of imported rows.
 
@@ -326,8 +326,7 @@ def _write_frame(frame: Any, folder: Path) -> Path:
         connect(folders=[folder]) as db,
     ):
         db.register("frame", frame)
-        written = str(path).replace("'", "''")
-        db.execute(f"COPY frame TO '{written}' (FORMAT parquet)")
+        db.view("frame").write_parquet(str(path))
     return path
 
 

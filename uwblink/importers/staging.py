@@ -57,10 +57,6 @@ Watch = Callable[[str, float], object]
 """Callback for progress: the current step ("reading", "writing" ...) and its completed share."""
 
 
-def unwatched(_step: str, _share: float) -> None:
-    """Ignore progress."""
-
-
 @dataclass(frozen=True, slots=True)
 class StagedRows:
     """The rows of a table for which an SQL condition is true; `origin` is their number among all rows read.
