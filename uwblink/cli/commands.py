@@ -208,8 +208,6 @@ def poses(
     force: Force = False,
 ) -> None:
     """Add poses of motion capture to a recording; --force replaces its poses."""
-    if not source and tags is None:
-        raise ImportTableError("found neither --from with poses nor --tags with anchors")
     source = source or []
     sources: Any = Path(source[0]) if source else {}
     if len(source) > 1 or (source and "=" in source[0] and not sources.exists()):

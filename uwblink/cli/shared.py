@@ -41,7 +41,7 @@ from uwblink.errors import ArgumentError, OfParameter, PlainWarning, UwblinkErro
 from uwblink.output import check_apart
 from uwblink.settings import flags_of
 
-FLAGS: Final = {"map_file": "--map", "tags_from": "--tags", "duration_s": "--duration"}
+FLAGS: Final = {"source": "--from", "map_file": "--map", "tags_from": "--tags", "duration_s": "--duration"}
 """Flags of parameters of uwblink that differ from the parameter's name with dashes."""
 
 USAGE_ERROR: Any = typer.BadParameter.__base__

@@ -206,6 +206,8 @@ def add_poses(
     """
     shift_ns = None if offset == "auto" else _offset_ns(offset)
     files = source if isinstance(source, Mapping) else {body: source}
+    if not files and tags_from is None:
+        raise ImportTableError("found neither `source` with poses nor `tags_from` with anchors")
     stated = load_map(map_file) if map_file else ColumnMap()
     read = [_read(path, name, topics, stated) for name, path in files.items()]
     parts, unturned = [part for part, _ in read], {name for part, turned in read if not turned for name in part.body}

@@ -550,3 +550,5 @@ def test_anchors_come_from_json_as_from_toml(tmp_path):
         processes.succeed("uwblink", "poses", tmp_path / f"{name}.uwb", "--tags", tmp_path / name)
         assert truth(tmp_path / f"{name}.uwb") == pytest.approx(5.0)
     processes.refuse("uwblink", "poses", tmp_path / "anchors.json.uwb", naming=["--from", "--tags"])
+    with pytest.raises(errors.ImportTableError, match="`source` with poses nor `tags_from`"):
+        add_poses(tmp_path / "anchors.json.uwb", {})
