@@ -7,7 +7,6 @@ shift.
 
 from __future__ import annotations
 
-import re
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -16,13 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.studies import write_section
+
 ROOT = Path(__file__).parents[1]
 TRAIN = ROOT / "scenarios" / "icra2023" / "train.toml"
 PAGE = ROOT / "docs" / "accuracy.md"
 LOSSES = ("mixture", "cauchy")
 SHARES = (0.0, 0.1, 0.3)
 SEEDS = 200
-BEGIN, END = "<!-- flights -->", "<!-- end of flights -->"
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,9 +96,7 @@ def main() -> None:
             outcomes[share] = [future.result() for future in track(futures, f"{100 * share:.0f} % reflections")]
     text = table(outcomes)
     print(text)
-    page = PAGE.read_text()
-    block = f"{BEGIN}\n{PREFACE.format(seeds=seeds, date=datetime.now(tz=UTC).date())}{text}\n{END}"
-    PAGE.write_text(re.sub(re.escape(BEGIN) + ".*" + re.escape(END), lambda _: block, page, flags=re.DOTALL))
+    write_section(PAGE, "flights", PREFACE.format(seeds=seeds, date=datetime.now(tz=UTC).date()) + text)
 
 
 PREFACE = """`make accuracy`, {date}: {seeds} seeds of [the icra2023 training flight](../scenarios/icra2023/train.toml), 38 400 exchanges each. Reflections last 0.15 s on average; their detours are exponential with a mean of 35 cm.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 
 import calib
 import uwbsim
+from benchmarks.studies import write_section
 
 PAGE: Final = Path("docs/motion-capture.md")
 FLIGHTS: Final = Path("scenarios/icra2023")
@@ -116,9 +116,7 @@ def main(seeds: int) -> None:
     for case in CASES:
         table += row(case, seeds)
         print(table.splitlines()[-1], flush=True)
-    page = PAGE.read_text(encoding="utf-8")
-    between = f"<!-- campaigns -->\n{table}<!-- end of campaigns -->"
-    PAGE.write_text(re.sub("<!-- campaigns -->.*?<!-- end of campaigns -->", lambda _: between, page, flags=re.S))
+    write_section(PAGE, "campaigns", table)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ The worlds share no code with the packages: `benchmarks.directions`, and those o
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -19,6 +18,7 @@ from rich.progress import track
 
 import calib
 from benchmarks.directions import PLANTED, SOUND, Recipe, flight, pattern_m
+from benchmarks.studies import write_section
 from calib.evaluation import Settings
 from calib.evaluation.localization import consistency
 from tests.calib.evaluation import drifting_flight
@@ -168,9 +168,7 @@ def main() -> None:
     lines.append(_line(filtered("in a filter: no drift, one tag, two tags", "online", drifts, seeds[:8])))
     lines.append(_line(filtered("constants of pairs of 0, 2, 5 cm", "robust", offsets, seeds[:8])))
     if args.write:
-        table = "\n".join(["<!-- dependences -->", *lines, "<!-- end of dependences -->"])
-        page = PAGE.read_text()
-        PAGE.write_text(re.sub("<!-- dependences -->.*<!-- end of dependences -->", lambda _: table, page, flags=re.S))
+        write_section(PAGE, "dependences", "\n".join(lines))
 
 
 def _line(cells: list[str]) -> str:

@@ -6,7 +6,6 @@ used to choose thresholds. `--tuning` uses the earlier seeds, which were.
 
 from __future__ import annotations
 
-import re
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -22,13 +21,13 @@ from scipy.spatial.transform import Rotation
 
 import calib
 from benchmarks.flights import FIRST_REPORTED, LIGHT, TICKS, Flight, Plan, fly
+from benchmarks.studies import write_section
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Fault
 from uwbsim import simulate
 from uwbsim.scenario.loading import load
 
 PAGE = Path(__file__).parents[1] / "docs" / "doctor.md"
-BEGIN, END = "<!-- table -->", "<!-- end of table -->"
 SEEDS: Final = 4
 CLEAN_SEEDS: Final = 10
 OF_FAULTS: Final = 700
@@ -578,9 +577,7 @@ def main() -> None:
     if "--tuning" in sys.argv:
         print(table(0))
         return
-    page = PAGE.read_text(encoding="utf-8")
-    text = f"{BEGIN}\n{table(FIRST_REPORTED)}\n{END}"
-    PAGE.write_text(re.sub(f"{BEGIN}.*?{END}", lambda _: text, page, flags=re.S), encoding="utf-8")
+    write_section(PAGE, "table", table(FIRST_REPORTED))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from benchmarks.fidelity_errors import (
     power_rows,
     twin_verdicts,
 )
+from benchmarks.studies import write_section
 from uwblink.ticks import TICK_S, elapsed
 from uwblink.twr import intervals
 from uwbsim import Simulated, simulate
@@ -29,7 +29,6 @@ PAGE = ROOT / "docs" / "accuracy.md"
 ICRA = ROOT / "scenarios" / "icra2023"
 BENCH = ROOT / "scenarios" / "two_boards_on_a_bench" / "bench.toml"
 
-BEGIN, END = "<!-- fidelity -->", "<!-- end of fidelity -->"
 HEAD = """`make fidelity`. Measured: 1833 exchanges of real boards (MILUV); raw and residual errors of Shalaby et al., ICRA 2023, sections V and VI; 17 118 samples published with the paper; 317 exchanges of one MILUV flight among obstacles. Simulated: the flights of `scenarios/icra2023`. A figure is *tuned* if a setting was chosen to match it, *predicted* if it follows from other settings.
 
 | what | measured | simulated | how |
@@ -51,9 +50,7 @@ def main() -> None:
         *detour_rows(),
     ]
     text = HEAD + _table(rows) + f"{TWIN}{'; '.join(twin_verdicts())}.\n"
-    page = PAGE.read_text(encoding="utf-8")
-    block = f"{BEGIN}\n{text}{END}"
-    PAGE.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: block, page, flags=re.DOTALL), encoding="utf-8")
+    write_section(PAGE, "fidelity", text)
     print(text)
 
 

@@ -7,9 +7,6 @@ fly in a room of the same size, of which only some numbers are known.
 
 from __future__ import annotations
 
-import argparse
-import re
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import calib
+from benchmarks.studies import options, write_section
 from benchmarks.trajectories import ERRING, WORLDS, World
 from tests.calib.trajectories.sines import flight
 from uwblink import KnownDistance
@@ -118,29 +116,21 @@ TITLES: Final = (
 HEAD: Final = f"| {' | '.join(TITLES)} |\n{'|---' * len(TITLES)}|"
 
 
-def main(argv: list[str]) -> int:
+def main() -> None:
     """Print the table, and write it into the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=24)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--only", default="")
-    parser.add_argument("--write", action="store_true")
-    given = parser.parse_args(argv)
+    parser = options(__doc__, seeds=24)
+    parser.add_argument("--only", default="", help="flights whose name has this in it")
+    given = parser.parse_args()
     lines = [HEAD]
     with ProcessPoolExecutor(given.workers) as pool:
         for name in OF_ROBOTS:
             if given.only in name:
                 seeds = given.seeds // FEWER.get(name, 1)
                 lines.append(row(name, list(pool.map(fitted, [name] * seeds, range(seeds))), promised(name)))
-                sys.stdout.write(lines[-1] + "\n")
-                sys.stdout.flush()
+                print(lines[-1], flush=True)
     if given.write:
-        page = PAGE.read_text(encoding="utf-8")
-        table = "\n".join(["<!-- plans:begin (written by `make plans`) -->", *lines, "<!-- plans:end -->"])
-        page = re.sub(r"<!-- plans:begin.*<!-- plans:end -->", lambda _: table, page, flags=re.DOTALL)
-        PAGE.write_text(page, encoding="utf-8")
-    return 0
+        write_section(PAGE, "plans", "\n".join(lines))
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    main()

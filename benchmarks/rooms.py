@@ -8,9 +8,6 @@ at different powers.
 
 from __future__ import annotations
 
-import argparse
-import re
-import sys
 from collections.abc import Callable
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
@@ -21,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import calib
+from benchmarks.studies import options, write_section
 from benchmarks.trajectories import localized_m, scenario
 from tests.calib.fitting.fields import ranges_with_field
 
@@ -146,28 +144,20 @@ def rows(kind: str, seeds: int, pool: Executor) -> list[str]:
     for name in names:
         every = range(FIRST_REPORTED, FIRST_REPORTED + seeds)
         found.append(row(name + more, list(pool.map(fly, [name] * seeds, every))))
-        sys.stdout.write(found[-1] + "\n")
-        sys.stdout.flush()
+        print(found[-1], flush=True)
     return found
 
 
-def main(argv: list[str]) -> int:
+def main() -> None:
     """Print the table, and write it into the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=12)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--only", choices=list(KINDS), nargs="*", default=list(KINDS))
-    parser.add_argument("--write", action="store_true")
-    given = parser.parse_args(argv)
+    parser = options(__doc__, seeds=12)
+    parser.add_argument("--only", choices=list(KINDS), nargs="*", default=list(KINDS), help="kinds of worlds")
+    given = parser.parse_args()
     with ProcessPoolExecutor(given.workers) as pool:
         lines = [HEAD, *(line for kind in given.only for line in rows(kind, given.seeds, pool))]
     if given.write:
-        table = "\n".join(["<!-- rooms -->", *lines, "<!-- end of rooms -->"])
-        page = PAGE.read_text(encoding="utf-8")
-        page = re.sub(r"<!-- rooms -->.*<!-- end of rooms -->", lambda _: table, page, flags=re.DOTALL)
-        PAGE.write_text(page, encoding="utf-8")
-    return 0
+        write_section(PAGE, "rooms", "\n".join(lines))
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    main()

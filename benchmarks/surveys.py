@@ -6,15 +6,10 @@ results are stored, one per line, and stored ones are not computed again.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import re
-import sys
-from collections.abc import Iterable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
-from dataclasses import asdict, dataclass
-from functools import partial
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -23,6 +18,7 @@ import numpy as np
 
 import calib
 from benchmarks.standing import DIMENSIONS, Standing, power_dbm, standing_boards
+from benchmarks.studies import options, outcomes_of, write_section
 from calib.planning import SurveyPlanSettings
 from calib.planning.result import PlannedArrangement
 from calib.planning.surveys import predict
@@ -199,53 +195,22 @@ def labels_row(name: str, outcomes: dict[int, Outcome]) -> str:
     return f"| {name.removesuffix(', labels exchanged')} | {found} | {others} |"
 
 
-def outcomes_of(name: str, seeds: int, results: Path | None, pool: Executor) -> dict[int, Outcome]:
-    """Return the results of a world by seed (from 1000 on); stored results are taken from a file."""
-    wanted = range(1000, 1000 + seeds)
-    stored = {} if results is None else {s: o for s, o in _stored(name, results) if s in wanted}
-    missing = [seed for seed in wanted if seed not in stored]
-    for seed, outcome in zip(missing, pool.map(partial(one, name), missing), strict=True):
-        stored[seed] = outcome
-        if results is not None:
-            with results.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"world": name, "seed": seed, **asdict(outcome)}) + "\n")
-    return dict(sorted(stored.items()))
-
-
-def _stored(name: str, results: Path) -> Iterator[tuple[int, Outcome]]:
-    lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
-    for line in map(json.loads, lines):
-        if line.pop("world") == name:
-            tags, errors, std = (tuple(line[key]) for key in ("tags", "errors_ns", "std_ns"))
-            yield line["seed"], Outcome(tags, errors, std, line["refused"], line.get("exchanged", ""))
-
-
-def _with_table(page: str, place: str, lines: list[str]) -> str:
-    marks = re.compile(rf"(<!-- {place}:begin[^>]*-->\n).*?(<!-- {place}:end -->)", re.DOTALL)
-    return marks.sub(lambda found: found[1] + "\n".join(lines) + "\n" + found[2], page)
-
-
-def main(argv: list[str]) -> int:
-    """Print the table, and write it into the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=50)
-    parser.add_argument("--workers", type=int, default=2)
+def main() -> None:
+    """Print the tables, and write them into the page."""
+    parser = options(__doc__, seeds=50)
     parser.add_argument("--only", default="", help="worlds whose name has this in it")
     parser.add_argument("--results", type=Path, help="file of outcomes, a line each: what it has is not surveyed again")
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    given = parser.parse_args(argv)
-    page = PAGE.read_text(encoding="utf-8")
+    given = parser.parse_args()
+    seeds = range(1000, 1000 + given.seeds)
     with ProcessPoolExecutor(given.workers) as pool:
         for place, worlds, head, line in (("surveys", WORLDS, HEAD, row), ("labels", LABELS, LABELS_HEAD, labels_row)):
             lines = [head]
             for name in filter(lambda name: given.only in name, worlds):
-                lines.append(line(name, outcomes_of(name, given.seeds, given.results, pool)))
+                lines.append(line(name, outcomes_of(name, seeds, one, Outcome, given.results, pool)))
                 print(lines[-1], flush=True)
-            page = _with_table(page, place, lines)
-    if given.write:
-        PAGE.write_text(page, encoding="utf-8")
-    return 0
+            if given.write:
+                write_section(PAGE, place, "\n".join(lines))
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    main()

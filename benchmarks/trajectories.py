@@ -8,14 +8,11 @@ with motion capture of the same flight.
 
 from __future__ import annotations
 
-import argparse
-import json
-import re
 import sys
 import tomllib
 from collections.abc import Callable
-from concurrent.futures import Executor, ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,6 +21,7 @@ from numpy.typing import NDArray
 
 import calib
 import uwbsim
+from benchmarks.studies import options, outcomes_of, write_section
 from tests.calib.trajectories.sines import flight
 
 ROOT: Final = Path(__file__).parents[1]
@@ -196,52 +194,22 @@ TITLES: Final = (
 HEAD: Final = f"| {' | '.join(TITLES)} |\n{'|---' * len(TITLES)}|"
 
 
-def outcomes_of(name: str, seeds: int, results: Path | None, pool: Executor) -> list[Outcome]:
-    """Return the results of a world; those in a file of results are taken from there, and new ones are added."""
-    stored = {} if results is None else _stored(name, results)
-    missing = [seed for seed in range(seeds) if seed not in stored]
-    for seed, outcome in zip(missing, pool.map(one, [name] * len(missing), missing), strict=True):
-        stored[seed] = outcome
-        if results is not None:
-            line = {"world": name, "seed": seed, **asdict(outcome), "scores": outcome.scores.tolist()}
-            with results.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(line) + "\n")
-    return [stored[seed] for seed in range(seeds)]
-
-
-def _stored(name: str, results: Path) -> dict[int, Outcome]:
-    lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
-    found = {}
-    for line in map(json.loads, lines):
-        if line.pop("world") == name:
-            seed, scores = line.pop("seed"), np.array(line.pop("scores"), dtype=np.float64)
-            found[seed] = Outcome(scores=scores, **line)
-    return found
-
-
-def main(argv: list[str]) -> int:
+def main() -> None:
     """Print the table, and write it into the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=50, help="at most so many a world")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--only", default="")
+    parser = options(__doc__, seeds=50)
+    parser.add_argument("--only", default="", help="worlds whose name has this in it")
     parser.add_argument("--results", type=Path, help="file of outcomes, a line each: what it has is not flown again")
-    parser.add_argument("--write", action="store_true")
-    given = parser.parse_args(argv)
+    given = parser.parse_args()
     lines = [HEAD]
     with ProcessPoolExecutor(given.workers) as pool:
-        for name in WORLDS:
+        for name, world in WORLDS.items():
             if given.only in name:
-                lines.append(row(name, outcomes_of(name, min(given.seeds, WORLDS[name].seeds), given.results, pool)))
-                sys.stdout.write(lines[-1] + "\n")
-                sys.stdout.flush()
+                seeds = range(min(given.seeds, world.seeds))
+                lines.append(row(name, [*outcomes_of(name, seeds, one, Outcome, given.results, pool).values()]))
+                print(lines[-1], flush=True)
     if given.write:
-        page = PAGE.read_text(encoding="utf-8")
-        table = "\n".join(["<!-- trajectories -->", *lines, "<!-- end of trajectories -->"])
-        page = re.sub(r"<!-- trajectories -->.*<!-- end of trajectories -->", lambda _: table, page, flags=re.DOTALL)
-        PAGE.write_text(page, encoding="utf-8")
-    return 0
+        write_section(PAGE, "trajectories", "\n".join(lines))
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    main()

@@ -5,7 +5,6 @@ Seeds start at `FIRST_REPORTED`; they were not used for tuning.
 
 from __future__ import annotations
 
-import re
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import numpy as np
 
 import calib
 from benchmarks import held_back
+from benchmarks.studies import write_section
 from benchmarks.worlds import CLEAN, FIRST_REPORTED, PLANTED, Recipe, World, make
 from calib.calibration.power_curves import basis
 
@@ -25,7 +25,6 @@ SAMPLES = PAGE.parents[2] / "shared" / "data" / "icra2023_bias_fpp.csv"
 SEEDS = 20
 PLANTINGS = 3
 TAGS = {"four": 4, "six": 6}
-BEGIN, END = "<!-- worlds -->", "<!-- end of worlds -->"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -161,9 +160,7 @@ def main() -> None:
         rows=taken(takes),
     )
     print(text)
-    page = PAGE.read_text()
-    block = f"{BEGIN}\n{text}{END}"
-    PAGE.write_text(re.sub(re.escape(BEGIN) + ".*" + re.escape(END), lambda _: block, page, flags=re.DOTALL))
+    write_section(PAGE, "worlds", text)
 
 
 def _samples() -> str:
