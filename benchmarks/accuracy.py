@@ -41,20 +41,19 @@ def one(share: float, seed: int, duration_s: float | None = None) -> dict[str, O
     from calib.data.sources import load_ranges
     from calib.evaluation.statistics import evaluate
     from calib.fitting.fitting import fit
+    from tests.calib.synthetic import about_their_mean
 
     settings = [f"run.seed={seed}", f"radio.multipath.share={share}"]
     settings += [f"run.duration_s={duration_s}"] if duration_s else []
-    ranges = load_ranges(uwbsim.simulate(uwbsim.load(TRAIN, settings)))
+    flight = uwbsim.simulate(uwbsim.load(TRAIN, settings))
+    ranges, delays_ns = load_ranges(flight), {int(tag): delay for tag, delay in flight.planted["delays_ns"].items()}
     found = {}
     for loss in LOSSES:
         calibration = fit(ranges, loss=loss).calibration
         judged = evaluate(ranges, calibration)
-        if judged.planted is None or calibration.uncertainty is None:
+        if judged.planted is None:
             sys.exit("the scenario planted nothing")
-        error = np.array([judged.planted.delay_error_ns[tag] for tag in calibration.uncertainty.tags])
-        count = len(error)
-        centre = np.eye(count) - 1 / count
-        std = np.sqrt(np.diag(centre @ np.array(calibration.uncertainty.delays_ns2) @ centre))
+        error, std = about_their_mean(calibration, delays_ns)
         found[loss] = Outcome(
             tuple((error / std).tolist()),
             1e3 * float(np.sqrt(np.mean(error**2))),

@@ -12,6 +12,7 @@ import numpy as np
 
 import calib
 from benchmarks.worlds import FIRST_REPORTED, Recipe, make
+from tests.calib.synthetic import about_their_mean
 
 SEEDS: Final = 100
 PER_SECOND: Final = 10.0
@@ -30,15 +31,10 @@ def main() -> None:
             print(f"| {count} | {tags} | {name} | {rms[0]:.0f} ({rms[1]:.0f}) | {inside:.0f} % |")
 
 
-def _one(recipe: Recipe, seed: int) -> tuple[Any, Any]:
+def _one(recipe: Recipe, seed: int) -> Any:
     """Return errors of delays relative to their mean, and their stated standard errors, in ns."""
     world = make(recipe, seed)
-    found = calib.fit(world.ranges, between_m=0.0).calibration
-    centre = np.eye(recipe.tags) - 1 / recipe.tags
-    error = centre @ [found.delays_ns[tag] - known for tag, known in world.delays_ns.items()]
-    if found.uncertainty is None:
-        raise RuntimeError("a fit without intervals")
-    return error, np.sqrt(np.diag(centre @ np.array(found.uncertainty.delays_ns2) @ centre))
+    return about_their_mean(calib.fit(world.ranges, between_m=0.0).calibration, world.delays_ns)
 
 
 if __name__ == "__main__":

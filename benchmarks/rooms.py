@@ -21,6 +21,7 @@ import calib
 from benchmarks.studies import options, write_section
 from benchmarks.trajectories import localized_m, scenario
 from tests.calib.fitting.fields import ranges_with_field
+from tests.calib.synthetic import about_their_mean
 
 PAGE: Final = Path(__file__).parents[1] / "docs" / "accuracy.md"
 FIRST_REPORTED: Final = 10_000
@@ -63,11 +64,7 @@ class Outcome:
 
 def outcome_of(result: calib.FitResult, planted_ns: dict[int, float], ratio: float = float("nan")) -> Outcome:
     """Compare a fit with the planted values."""
-    found: Any = result.calibration
-    tags = list(found.uncertainty.tags)
-    centre = np.eye(len(tags)) - 1 / len(tags)
-    errors = centre @ np.array([found.delays_ns[tag] - planted_ns[tag] for tag in tags])
-    std = np.sqrt(np.diag(centre @ np.array(found.uncertainty.delays_ns2) @ centre))
+    errors, std = about_their_mean(result.calibration, planted_ns)
     return Outcome(
         errors_ps=1e3 * errors,
         std_ps=1e3 * std,

@@ -19,6 +19,7 @@ from benchmarks import held_back
 from benchmarks.studies import write_section
 from benchmarks.worlds import CLEAN, FIRST_REPORTED, PLANTED, Recipe, World, make
 from calib.calibration.power_curves import basis
+from tests.calib.synthetic import about_their_mean
 
 PAGE = Path(__file__).parents[1] / "docs" / "accuracy.md"
 SAMPLES = PAGE.parents[2] / "shared" / "data" / "icra2023_bias_fpp.csv"
@@ -49,11 +50,8 @@ def judged(world: World, other: World | None = None) -> Outcome:
     """
     found = calib.fit(world.ranges, between_m=0.0)
     known = found.calibration
-    tags = list(world.delays_ns)
-    centre = np.eye(len(tags)) - 1 / len(tags)
-    error = centre @ np.array([known.delays_ns[tag] - world.delays_ns[tag] for tag in tags])
+    error, std = about_their_mean(known, world.delays_ns)
     uncertainty: Any = known.uncertainty
-    std = np.sqrt(np.diag(centre @ np.array(uncertainty.delays_ns2) @ centre))
     grid = np.quantile(world.lifted, np.linspace(0.01, 0.99, 60))
     splines = basis(grid, np.array(known.bias_curve.knots))
     splines = splines - splines.mean(axis=0)
