@@ -9,7 +9,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +50,20 @@ def recorded(ports: list[str], path: Path, *more: str) -> tuple[float, str]:
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, done.stdout.strip()
 
 
+@contextmanager
+def served(scenario: Path, folder: Path, *tags: int) -> Iterator[tuple[int, list[str]]]:
+    """Serve boards in a separate process; yield its id, and the ports of tags, as links in a folder."""
+    words = [str(BIN / "uwbsim"), "serve", str(scenario), "--link-dir", str(folder)]
+    server, ports = subprocess.Popen(words, stdout=subprocess.PIPE), [str(folder / f"tag{tag}") for tag in tags]
+    try:
+        while not all(map(os.path.exists, ports)):
+            time.sleep(0.1)
+        yield server.pid, ports
+    finally:
+        server.send_signal(signal.SIGINT)
+        server.wait()
+
+
 def ten_boards(folder: Path) -> None:
     tags = "\n".join(f'[[tags]]\nid = {k}\nbody = "b{k}"\n' for k in range(10))
     bodies = "\n".join(
@@ -57,19 +72,10 @@ def ten_boards(folder: Path) -> None:
     )
     scenario = folder / "ten.toml"
     scenario.write_text(f"[run]\nduration_s = 60\n[ranging]\nrate_hz = 100\n{bodies}\n{tags}")
-    server = subprocess.Popen(
-        [str(BIN / "uwbsim"), "serve", str(scenario), "--link-dir", str(folder / "ports")], stdout=subprocess.PIPE
-    )
-    try:
-        ports = [str(folder / "ports" / f"tag{k}") for k in range(10)]
-        while not all(map(os.path.exists, ports)):
-            time.sleep(0.1)
+    with served(scenario, folder / "ports", *range(10)) as (_, ports):
         cpu, line = recorded(
             ports, folder / "ten.uwb", "--pairs", "all", "--rate", "200", "--duration", str(int(SECONDS))
         )
-    finally:
-        server.send_signal(signal.SIGINT)
-        server.wait()
     row(
         "ten served boards, 200 exchanges/s in total, 60 s",
         "none lost",
@@ -103,18 +109,12 @@ def ten_sources(folder: Path, burst: int) -> None:
 def round_trip() -> None:
     from uwblink.boards.board import Board
 
-    with tempfile.TemporaryDirectory() as folder:
-        server = subprocess.Popen(
-            [str(BIN / "uwbsim"), "serve", str(BENCH), "--link-dir", folder], stdout=subprocess.PIPE
-        )
-        while not (Path(folder) / "tag20").exists():
-            time.sleep(0.1)
-        try:
-            with Board.open(f"{folder}/tag10") as board:
-                times = timed(lambda: board.range(20), 2000)
-        finally:
-            server.send_signal(signal.SIGINT)
-            server.wait()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        served(BENCH, Path(folder), 10, 20) as (_, ports),
+        Board.open(ports[0]) as board,
+    ):
+        times = timed(lambda: board.range(20), 2000)
     row(
         "`twr` round trip through a pseudo-terminal, default delay",
         "median below 6 ms",

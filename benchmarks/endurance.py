@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -12,13 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.boards import BENCH, BIN, served
 from uwblink.recording.file import Recording
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import raw_range
 
-ROOT = Path(__file__).parents[1]
-BIN = Path(sys.executable).parent
-BENCH = ROOT / "scenarios" / "two_boards_on_a_bench" / "bench.toml"
 KILLS = 50
 PROMISED_S = 0.25
 SERVED_S = 600.0
@@ -27,18 +24,8 @@ SERVED_S = 600.0
 def main() -> None:
     """Run both tests; exit with status 1 if one fails."""
     minutes = float(sys.argv[1]) / 60 if len(sys.argv) > 1 else SERVED_S / 60
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        server = subprocess.Popen(
-            [str(BIN / "uwbsim"), "serve", str(BENCH), "--link-dir", str(folder)], stdout=subprocess.PIPE
-        )
-        try:
-            while not (folder / "tag20").exists():
-                time.sleep(0.1)
-            good = kills(folder) and long_serve(folder, server.pid, minutes * 60)
-        finally:
-            server.send_signal(signal.SIGINT)
-            server.wait()
+    with tempfile.TemporaryDirectory() as name, served(BENCH, Path(name), 10, 20) as (server, _):
+        good = kills(Path(name)) and long_serve(Path(name), server, minutes * 60)
     sys.exit(not good)
 
 
