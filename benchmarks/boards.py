@@ -9,14 +9,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).parents[1]
-BIN = Path(sys.executable).parent
+from benchmarks.__main__ import BIN, ROOT, durations, row
+
 BENCH = ROOT / "scenarios" / "two_boards_on_a_bench" / "bench.toml"
 SECONDS = 60.0
 
@@ -32,10 +32,6 @@ def main() -> None:
     round_trip()
     driver_share()
     decoder()
-
-
-def row(what: str, goal: str, figure: str) -> None:
-    print(f"| {what} | {goal} | {figure} |", flush=True)
 
 
 def recorded(ports: list[str], path: Path, *more: str) -> tuple[float, str]:
@@ -114,7 +110,7 @@ def round_trip() -> None:
         served(BENCH, Path(folder), 10, 20) as (_, ports),
         Board.open(ports[0]) as board,
     ):
-        times = timed(lambda: board.range(20), 2000)
+        times = durations(lambda: board.range(20), 2000, 200)
     row(
         "`twr` round trip through a pseudo-terminal, default delay",
         "median below 6 ms",
@@ -140,7 +136,7 @@ def driver_share() -> None:
                 terminal.write(line)
     try:
         with Board.open(terminal.name) as board:
-            times = timed(lambda: board.range(99), 5000)
+            times = durations(lambda: board.range(99), 5000, 500)
     finally:
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)
@@ -150,17 +146,6 @@ def driver_share() -> None:
         "median below 150 us, 99 % below 400 us",
         f"median {np.median(times) * 1e6:.0f} us, 99 % {np.quantile(times, 0.99) * 1e6:.0f} us",
     )
-
-
-def timed(work: Callable[[], object], count: int) -> np.ndarray:
-    for _ in range(count // 10):
-        work()
-    times = np.empty(count)
-    for k in range(count):
-        start = time.perf_counter()
-        work()
-        times[k] = time.perf_counter() - start
-    return times
 
 
 def decoder() -> None:

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.boards import BENCH, BIN, served
+from benchmarks.__main__ import BIN
+from benchmarks.boards import BENCH, served
 from uwblink.recording.file import Recording
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import raw_range

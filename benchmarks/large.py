@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from benchmarks.__main__ import durations
+
 if TYPE_CHECKING:
     from calib.data.ranges import Ranges
 
@@ -56,12 +58,7 @@ def one_size(size: int) -> list[str]:
 
 def processor_time(work: Callable[[], object], runs: int) -> float:
     """Return the median time of some runs in seconds; the first of several runs is not counted."""
-    times = []
-    for _ in range(runs + (runs > 1)):
-        start = time.process_time()
-        work()
-        times.append(time.process_time() - start)
-    return float(np.median(times[runs > 1 :]))
+    return float(np.median(durations(work, runs, int(runs > 1), time.process_time)))
 
 
 def settled(ranges: Ranges, loss: str | None) -> None:

@@ -47,6 +47,7 @@ def pairs(folder: Path) -> list[Pair]:
     import calib
     import uwblink
     import uwbsim
+    from benchmarks.__main__ import LISTENING
     from benchmarks.importing import TABLE
     from calib.fitting.fitting import fit
     from uwblink.protocols.table import PROTOCOLS
@@ -57,7 +58,7 @@ def pairs(folder: Path) -> list[Pair]:
     flight = uwbsim.simulate(scenario)
     flight.save(folder / "train.uwb")
     ranges = calib.load_ranges(folder / "train.uwb")
-    heard = calib.load_ranges(uwbsim.simulate(uwbsim.load(TRAIN, [f"tags.{k}.passive=true" for k in range(6)])))
+    heard = calib.load_ranges(uwbsim.simulate(uwbsim.load(TRAIN, LISTENING)))
     calibration = calib.fit(ranges).calibration
     errors = ranges.raw_m - ranges.truth_m
     panels = [{"power_dbm": ranges.fpp1_dbm, "error_m": errors}] * FIGURES
