@@ -10,7 +10,6 @@ import numpy as np
 
 from benchmarks.fidelity_detours import detour_rows
 from benchmarks.fidelity_errors import (
-    DATA,
     TUNED,
     Row,
     dependence_rows,
@@ -18,6 +17,7 @@ from benchmarks.fidelity_errors import (
     power_rows,
     twin_verdicts,
 )
+from benchmarks.nlos import SHARED
 from benchmarks.studies import write_section
 from uwblink.ticks import TICK_S, elapsed
 from uwblink.twr import intervals
@@ -37,8 +37,8 @@ HEAD = """`make fidelity`. Measured: 1833 exchanges of real boards (MILUV); raw 
 
 
 def main() -> None:
-    if not DATA.is_dir():
-        sys.exit(f"{DATA}: the measured data are not there (or set UWBCAL_DATA)")
+    if not SHARED.is_dir():
+        sys.exit(f"{SHARED}: the measured data are not there (or set UWBCAL_DATA)")
     train, one, two = (simulate(load_scenario(ICRA / f"{n}.toml")) for n in ("train", "test1", "test2"))
     rows = [
         *timing_rows(train),

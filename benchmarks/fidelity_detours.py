@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.fidelity_errors import DATA, PREDICTED, TUNED, Row
-from benchmarks.nlos import DETOUR_M, RESPONSE, RISE, ROOMS, of_real_flight, of_room, published_error_m
+from benchmarks.fidelity_errors import PREDICTED, TUNED, Row
+from benchmarks.nlos import DETOUR_M, RESPONSE, RISE, ROOMS, SHARED, of_real_flight, of_room, published_error_m
 
 
 def detour_rows() -> list[Row]:
@@ -16,9 +16,9 @@ def detour_rows() -> list[Row]:
     rooms = [of_room(seed) for seed in ROOMS[:12]]
     late = np.concatenate([one.raw_m - one.truth_m for one in rooms]) > DETOUR_M
     simulated = np.concatenate([one.features for one in rooms])
-    flight = of_real_flight(DATA)
+    flight = of_real_flight(SHARED)
     real, known = flight.features, np.isfinite(flight.features[:, RISE])
-    beyond = published_error_m(flight, DATA) > DETOUR_M
+    beyond = published_error_m(flight, SHARED) > DETOUR_M
 
     def told(found: NDArray[np.floating], column: int, digits: int) -> str:
         return ", ".join(f"{v:.{digits}f}" for v in np.nanquantile(found[:, column], (0.05, 0.25, 0.5, 0.75, 0.95)))

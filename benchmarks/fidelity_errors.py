@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
-import tarfile
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,20 +10,17 @@ from typing import Final
 
 import numpy as np
 
+from benchmarks.nlos import SHARED, of_real_flight, real_flight
 from calib.calibration.formats import read_miluv
 from calib.data.ranges import concatenate
 from calib.data.sources import load_ranges
 from calib.evaluation.statistics import evaluate
 from calib.fitting.fitting import fit
 from uwblink.arrays import Floats, Ints
-from uwblink.importers import import_recording, read_source
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import delay_weights, raw_range
 from uwbsim import Simulated, twin
 
-ROOT = Path(__file__).parents[1]
-DATA = Path(os.environ.get("UWBCAL_DATA", ROOT.parent / "shared" / "data"))
-MILUV = "cirObstacles_3_random_0"
 TAIL_M = 0.3
 REJECTED = 3.9
 """Number of standard deviations; the published samples have no errors beyond it."""
@@ -64,7 +59,7 @@ def error_rows(train: Simulated, one: Simulated, two: Simulated) -> list[Row]:
 
 def power_rows(flight: Simulated) -> list[Row]:
     """Return rows on lifted powers, and on errors by power without antenna delays and outliers."""
-    lifted, bias = np.loadtxt(DATA / "icra2023_bias_fpp.csv", delimiter=",", skiprows=1).T
+    lifted, bias = np.loadtxt(SHARED / "icra2023_bias_fpp.csv", delimiter=",", skiprows=1).T
     edges = np.quantile(lifted, np.linspace(0, 1, 7))
     error, mine = _without_delays(flight), _lifted(flight)
     rows = [("lifted powers: 5, 25, 50, 75, 95 %", _listed(lifted), _listed(mine), TUNED)]
@@ -118,10 +113,7 @@ def _without_delays(flight: Simulated) -> Floats:
 
 def dependence_rows(flight: Simulated) -> list[Row]:
     """Return rows on the dependence of errors of a pair in time: real flight, test1, and test1 at a high rate."""
-    with tempfile.TemporaryDirectory() as folder:
-        import_recording(_unpacked(folder), Path(folder) / "real.uwb", importer="miluv")
-        real = load_ranges(Path(folder) / "real.uwb")
-    e = flight.exchanges
+    e, real = flight.exchanges, of_real_flight(SHARED)
     pair, error = e.initiator * 1000 + e.target, raw_range(e) - flight.truth_m
     seldom = _every(GAP_S, e.time_ns, pair)
     its_pair = np.minimum(real.initiator, real.target) * 1000 + np.maximum(real.initiator, real.target)
@@ -187,16 +179,8 @@ def trace_db(error: Floats, power_dbm: Floats) -> float:
 
 def twin_verdicts() -> list[str]:
     """Return, for each verdict, the quantities of the real flight and its twin, with their largest differences."""
-    with tempfile.TemporaryDirectory() as folder:
-        real = read_source(_unpacked(folder), importer="miluv")
-    found = twin(real, read_miluv(DATA / "miluv_published_calibration.json"))
+    found = twin(real_flight(SHARED), read_miluv(SHARED / "miluv_published_calibration.json"))
     quantities: dict[str, list[str]] = {}
     for one in found.compare(seeds=3):
         quantities.setdefault(one.verdict, []).append(f"{one.name} ({100 * one.distance:.0f} %)")
     return [f"{verdict}: {', '.join(names)}" for verdict, names in quantities.items()]
-
-
-def _unpacked(folder: str) -> Path:
-    with tarfile.open(DATA / f"miluv_{MILUV}.tar.xz") as packed:
-        packed.extractall(folder, filter="data")
-    return Path(folder) / MILUV

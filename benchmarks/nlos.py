@@ -21,8 +21,8 @@ import uwbsim
 from calib.calibration.formats import read_miluv
 from calib.data.ranges import FEATURES, Ranges
 from uwblink.arrays import Bools, Floats
-from uwblink.importers import import_recording
-from uwblink.recording.contents import Contents, load
+from uwblink.importers import read_source
+from uwblink.recording.contents import Contents
 
 ROOT = Path(__file__).parents[1]
 SHARED = Path(os.environ.get("UWBCAL_DATA", ROOT.parent / "shared" / "data"))
@@ -86,9 +86,7 @@ def real_flight(folder: Path) -> Contents:
     with tempfile.TemporaryDirectory() as scratch:
         with tarfile.open(folder / FLIGHT) as archive:
             archive.extractall(scratch, filter="data")
-        name = FLIGHT.removeprefix("miluv_").removesuffix(".tar.xz")
-        import_recording(Path(scratch) / name, Path(scratch) / "f.uwb", importer="miluv")
-        return load(Path(scratch) / "f.uwb")
+        return read_source(Path(scratch) / FLIGHT.removeprefix("miluv_").removesuffix(".tar.xz"), importer="miluv")
 
 
 def of_real_flight(folder: Path) -> Ranges:
