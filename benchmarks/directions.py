@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from calib.data.samples import stamped
 from uwblink.recording.antenna_delays import AntennaDelay, meta_of_delays
@@ -214,9 +215,8 @@ def _wander(rng: np.random.Generator, recipe: Recipe, time_s: Floats, which: Any
     grid = np.arange(0, recipe.seconds + 0.2, 0.1)
     found = np.zeros(len(time_s))
     for pair in np.unique(which):
-        path = np.zeros(len(grid))
-        for k in range(1, len(grid)):
-            path[k] = np.exp(-0.1 / 3) * path[k - 1] + np.sqrt(1 - np.exp(-0.2 / 3)) * rng.normal()
+        kicks = np.sqrt(1 - np.exp(-0.2 / 3)) * rng.normal(size=len(grid) - 1)
+        path = lfilter([1.0], [1.0, -np.exp(-0.1 / 3)], np.append(0.0, kicks))
         rows = which == pair
         found[rows] = np.interp(time_s[rows], grid, path)
     return found

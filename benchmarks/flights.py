@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.worlds import reflected_s
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.twr import Exchanges
 
@@ -187,13 +188,9 @@ def _detours(plan: Plan, rng: np.random.Generator, time_s: Floats, which: Any, p
     found = np.zeros(count)
     for pair in range(pairs):
         rows, share = np.flatnonzero(which == pair), float(np.clip(plan.share * rng.uniform(0.3, 1.7), 0.01, 0.9))
-        now, reflected = 0.0, rng.random() < share
-        while now < plan.seconds:
-            until = now + rng.exponential(plan.lasts_s if reflected else plan.lasts_s * (1 - share) / share)
-            some = rows[(time_s[rows] >= now) & (time_s[rows] < until)]
-            if reflected:
-                found[some] = rng.gamma(1.5, plan.detour_m / 1.5) * rng.gamma(9, 1 / 9, len(some))
-            now, reflected = until, not reflected
+        for begin, end in reflected_s(rng, share, plan.lasts_s, plan.seconds):
+            some = rows[(time_s[rows] >= begin) & (time_s[rows] < end)]
+            found[some] = rng.gamma(1.5, plan.detour_m / 1.5) * rng.gamma(9, 1 / 9, len(some))
     return found
 
 

@@ -10,13 +10,14 @@ reported.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from calib.data.ranges import Ranges
 
@@ -171,16 +172,23 @@ def _detours(
     found = np.zeros(count)
     for pair in range(len(shares)):
         rows, share = np.flatnonzero(which == pair), float(np.clip(shares[pair], 1e-3, 0.95))
-        now, reflected = 0.0, rng.random() < share
-        while now < recipe.seconds:
-            mean = recipe.lasts_s if reflected else recipe.lasts_s * (1 - share) / share
-            until = now + rng.exponential(mean)
-            some = rows[(time_s[rows] >= now) & (time_s[rows] < until)]
-            if reflected:
-                # A wall has one detour, about which ranges vary by a third.
-                found[some] = _lengths(rng, recipe, 1)[0] * rng.gamma(9, 1 / 9, len(some))
-            now, reflected = until, not reflected
+        for begin, end in reflected_s(rng, share, recipe.lasts_s, recipe.seconds):
+            some = rows[(time_s[rows] >= begin) & (time_s[rows] < end)]
+            # A wall has one detour, about which ranges vary by a third.
+            found[some] = _lengths(rng, recipe, 1)[0] * rng.gamma(9, 1 / 9, len(some))
     return found
+
+
+def reflected_s(
+    rng: np.random.Generator, share: float, lasts_s: float, seconds: float
+) -> Iterator[tuple[float, float]]:
+    """Draw the intervals in which a pair is reflected: a `share` of the time, on average `lasts_s` long each."""
+    now, reflected = 0.0, rng.random() < share
+    while now < seconds:
+        until = now + rng.exponential(lasts_s if reflected else lasts_s * (1 - share) / share)
+        if reflected:
+            yield now, until
+        now, reflected = until, not reflected
 
 
 def _lengths(rng: np.random.Generator, recipe: Recipe, count: int) -> Floats:
@@ -201,11 +209,8 @@ def _wander(rng: np.random.Generator, recipe: Recipe, time_s: Floats, which: Any
     grid = np.arange(0, recipe.seconds + 2 * step, step)
     keep = np.exp(-step / recipe.wander_s)
     for pair in range(pairs):
-        path = np.empty(len(grid))
-        path[0] = rng.normal()
-        kicks = rng.normal(size=len(grid)) * np.sqrt(1 - keep**2)
-        for k in range(1, len(grid)):
-            path[k] = keep * path[k - 1] + kicks[k]
+        first, kicks = rng.normal(), rng.normal(size=len(grid)) * np.sqrt(1 - keep**2)
+        path = lfilter([1.0], [1.0, -keep], np.append(first, kicks[1:]))
         rows = which == pair
         found[rows] = recipe.wander_m * np.interp(time_s[rows], grid, path)
     return found
