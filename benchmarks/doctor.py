@@ -102,12 +102,7 @@ def tag_of(flight: Flight, rng: np.random.Generator) -> int:
     return int(rng.choice([tag.tag for tag in flight.tags if tag.tag < 100]))
 
 
-def pair_off(flight: Flight, rng: np.random.Generator) -> Flight:
-    """Make the ranges of one pair 12 to 30 cm longer."""
-    return longer_pair(flight, rng, None)
-
-
-def longer_pair(flight: Flight, rng: np.random.Generator, metres: float | None) -> Flight:
+def longer_pair(flight: Flight, rng: np.random.Generator, metres: float | None = None) -> Flight:
     """Lengthen the ranges of one pair, by default by 12 to 30 cm."""
     e = flight.exchanges
     pairs = np.unique(np.sort(np.column_stack([e.initiator, e.target]), axis=1), axis=0)
@@ -472,7 +467,7 @@ FAULTS: Final = (
     Case("the same, reflections that last 5 s", Plan(share=0.1, lasts_s=5.0), stepped,
          names("delay changed mid-flight"), names(LASTING)),
     Case("a delay drifts by 1 ns", BASE, drifting, names("delay drifts", "delay changed mid-flight")),
-    Case("a pair 12 to 30 cm long", BASE, pair_off, names("pairs that do not close")),
+    Case("a pair 12 to 30 cm long", BASE, longer_pair, names("pairs that do not close")),
     Case("a tag that hardly answers", BASE, dead, names("dead or deaf tag")),
     Case("nothing moves", BASE, still, names("static data")),
     Case("power that follows distance", Plan(turning_db=0.1), nothing, names("power confounded with distance")),

@@ -33,10 +33,6 @@ def _simulated(name: str, seconds: float, seed: int) -> Any:
     return uwbsim.simulate(uwbsim.load(name, {"run.duration_s": seconds, "run.seed": seed}))
 
 
-def _flown(plan: Plan, seed: int) -> Any:
-    return fly(plan, seed)
-
-
 SCENARIOS: Final = {
     "six_robots/six_robots": (12, 60),
     "anchors_and_tag/anchors_and_tag": (12, 60),
@@ -52,10 +48,10 @@ WORLDS: Final[dict[str, Callable[[int], Any]]] = {
     **{f"{name}, {s} s": partial(_simulated, name, float(s)) for name, several in SCENARIOS.items() for s in several},
     "broadcast, 12 s, receptions": partial(_simulated, "broadcast", 12.0),
     "three_quadcopters, 12 s, receptions": partial(_simulated, "three_quadcopters", 12.0),
-    "flight of three bodies": partial(_flown, MINUTE),
-    "flight of five tags": partial(_flown, replace(MINUTE, tags_a_body=1, bodies=5)),
-    "flight among four anchors": partial(_flown, replace(MINUTE, anchors=4, tags_a_body=1)),
-    "single-sided flight, corrected": partial(_flown, replace(MINUTE, protocol="ss-cfo")),
+    "flight of three bodies": partial(fly, MINUTE),
+    "flight of five tags": partial(fly, replace(MINUTE, tags_a_body=1, bodies=5)),
+    "flight among four anchors": partial(fly, replace(MINUTE, anchors=4, tags_a_body=1)),
+    "single-sided flight, corrected": partial(fly, replace(MINUTE, protocol="ss-cfo")),
 }
 """Worlds without a fault: some of the simulator, and four of a generator that shares no code with it."""
 

@@ -63,14 +63,14 @@ class World:
 
 
 WORLDS: Final = {
-    "sines, known for 8 of 24 s": World(lambda seed: _sines(seed), {"poses_until_s": 8.0}),
+    "sines, known for 8 of 24 s": World(_sines, {"poses_until_s": 8.0}),
     "sines, four anchors given, no known start": World(
         lambda seed: _sines(seed, anchors=CORNERS, rate=120), {"poses_until_s": 0.0}
     ),
     "sines, four anchors sought, known for 8 s": World(
         lambda seed: _sines(seed, anchors=CORNERS, rate=120), {"poses_until_s": 8.0, "anchors": "sought"}
     ),
-    "sines, nothing known": World(lambda seed: _sines(seed), {"poses_until_s": 0.0}),
+    "sines, nothing known": World(_sines, {"poses_until_s": 0.0}),
     "icra2023 test 1, 60 s, known for 10 s": World(
         lambda seed: scenario("icra2023/test1.toml", seed, 60.0), {"poses_until_s": 10.0}, False
     ),
