@@ -93,7 +93,7 @@ def outcomes(room: str, module: str = "", name: str = "", factor: float = 1.0) -
     return dict(zip(CASES[room], json.loads(ran.stdout), strict=True))
 
 
-def main(wanted: list[str]) -> int:
+def main(wanted: list[str]) -> None:
     """Print a line per constant, factor and case."""
     tried = [
         (room, module, name, factor)
@@ -108,8 +108,7 @@ def main(wanted: list[str]) -> int:
         for (room, _, name, factor), found in zip(tried, pool.map(lambda one: outcomes(*one), tried), strict=True):
             for case, new in found.items():
                 print(f"{name} x {factor:g}, {case}: {compared(before[room][case], new)}", flush=True)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main(sys.argv[1:])

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -127,23 +126,22 @@ def compared(old: dict[str, Any], new: dict[str, Any]) -> str:
     )
 
 
-def main(argv: list[str]) -> int:
+def main() -> None:
     """Write the file, or compare with it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", action="store_true", help="write the file instead of comparing with it")
     parser.add_argument("--workers", type=int, default=2)
-    given = parser.parse_args(argv)
+    given = parser.parse_args()
     names = list(cases())
     with ProcessPoolExecutor(given.workers) as pool:
         found = dict(zip(names, pool.map(outcome, names), strict=True))
     if given.write:
         FILE.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-        return 0
+        return
     stored = json.loads(FILE.read_text(encoding="utf-8"))
     for name, new in found.items():
         print(f"{name}: {compared(stored[name], new) if name in stored else 'not stored'}")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main()

@@ -50,7 +50,7 @@ print(f"\\n{used.ru_utime + used.ru_stime:7.2f} s {used.ru_maxrss / 1024:7.0f} M
 """
 
 
-def main(rows: int = ROWS) -> int:
+def main(rows: int = ROWS) -> None:
     """Print a line per task."""
     with tempfile.TemporaryDirectory() as folder:
         for name, code, argument in (
@@ -69,8 +69,7 @@ def main(rows: int = ROWS) -> int:
             done = subprocess.run(words, cwd=Path(folder), check=True, capture_output=True, text=True)
             if name:
                 print(f"{name:40s}{done.stdout.splitlines()[-1]}")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(int(sys.argv[1]) if len(sys.argv) > 1 else ROWS))
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else ROWS)

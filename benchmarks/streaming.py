@@ -4,7 +4,6 @@
 """
 
 import socket
-import sys
 import threading
 import time
 
@@ -18,7 +17,7 @@ from uwblink.wire import RangeReport
 COUNT = 1000
 
 
-def main() -> int:
+def main() -> None:
     """Print the median and the 99th percentile of the latencies."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear, served() as server:
         ear.bind(("127.0.0.1", 0))
@@ -50,8 +49,7 @@ def main() -> int:
         listener.join(10)
     late = (np.array(arrived) - np.array(came[: len(arrived)])) * 1e-6
     print(f"{len(late)} ranges: median {np.median(late):.2f} ms, 99 % within {np.percentile(late, 99):.2f} ms")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
