@@ -368,10 +368,6 @@ def _grid(path: Path, name: str) -> dict[str, Any]:
     return {"azimuth_deg": azimuth, "elevation_deg": elevation, name: values}
 
 
-def _plan(path: Path, *_: Any) -> dict[str, Any]:
-    return {"slots": [(time_s, int(a), int(b)) for time_s, a, b in _rows(path, "time_s", "initiator", "target")]}
-
-
 def _profile(path: Path, key: str, *_: Any) -> dict[str, Any]:
     times_s, values = zip(*_rows(path, "time_s", key), strict=True)
     return {"times_s": times_s, "values": values}
@@ -402,7 +398,7 @@ def _trajectory(path: Path, _key: str, named: Mapping[str, Any]) -> dict[str, An
 
 READERS_OF_FILES: Final[dict[str, tuple[str | None, Callable[[Path, str, Mapping[str, Any]], dict[str, Any]]]]] = {
     "antenna": (None, lambda path, *_: _grid(path, "gain_db")),
-    "plan": (None, _plan),
+    "plan": (None, lambda path, *_: {"slots": _rows(path, "time_s", "initiator", "target")}),
     "group_delay": ("table", lambda path, *_: _grid(path, "delay_cm")),
     "motion": ("recorded", _trajectory),
     "temperature_c": ("table", _profile),

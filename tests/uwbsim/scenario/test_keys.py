@@ -227,6 +227,7 @@ def planned(tmp_path, slots):
     ("make", "contents", "message"),
     [
         (planned, "0.1,1,99\n", "slot 1 names tag 99"),
+        (planned, "0.1,1.9,3\n", r"ranging\.plan\.slots\[0\]\[1\]: found 1\.9, input should be a valid integer"),
         (planned, "0.1,1,3\n0.2,1,1\n", "slot 2 is of tag 1 with itself"),
         (planned, "-0.1,1,3\n", r"slot 1 is at -0.1 s, before the start"),
         (planned, "9,1,3\n7,3,1\n", r"first slot is at 7 s, after the end of the run \(run.duration_s = 6\)"),
