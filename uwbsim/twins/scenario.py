@@ -54,7 +54,7 @@ def _toml(value: Any) -> str:
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {_toml(one)}" for key, one in value.items()) + " }"
     if not isinstance(value, list | tuple):
-        return json.dumps(value)
+        return json.dumps(value, ensure_ascii=False)
     items = [_toml(one) for one in value]
     if value and isinstance(value[0], Mapping):
         return "[\n  " + ",\n  ".join(items) + ",\n]"

@@ -460,6 +460,7 @@ def test_masts_are_static_and_robots_fly_as_recorded(other_found):
 def test_two_messages_at_random_times_have_a_plan_and_no_noise_of_stamps(tmp_path):
     tables = world(20.0, rate_hz=100.0)
     tables["ranging"] |= {"protocol": "ss", "plan": "aloha"}
+    tables["bodies"][0]["name"] = tables["tags"][0]["body"] = "robot \U0001f681"  # TOML has no pairs of surrogates
     tables["radio"] = {"rx_noise_ps": 150.0, "first_path_at_1m_dbm": -72.0}
     flight = uwbsim.simulate(tables, contention=False)
     twin = uwbsim.twin(flight, known(tables))
