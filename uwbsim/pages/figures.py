@@ -195,7 +195,7 @@ def timing(width_in: float, scenario: Scenario, name: str) -> Figure:
     protocol, narrow, ranging = PROTOCOLS[name], width_in < NARROW_IN, scenario.ranging
     # A delayed frame leaves later than scheduled by the antenna delay of its board.
     scheduled_s = ranging.scheduled_s + ANTENNA_DELAY_TICKS * TICK_S
-    found = exchange(protocol, Conditions.single(at_once=ranging.at_once_s, scheduled=scheduled_s))
+    found = exchange(protocol, Conditions.single(at_once=ranging.reply.median_s, scheduled=scheduled_s))
     stamps_us = {stamp: float(ticks[0]) * TICK_S * 1e6 for stamp, ticks in found.stamps.items()}
     figure, (axes,) = sheet(width_in, height_in=2.3)
     for level in (0, 1):

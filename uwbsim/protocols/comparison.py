@@ -200,7 +200,7 @@ def costs(scenario: Scenario, protocol: RangingProtocol, scheduled_s: float | No
     """
     ranging = scenario.ranging
     return exchange_costs(
-        protocol, scenario.radio.preamble_symbols, scheduled_s or ranging.scheduled_s, ranging.at_once_s
+        protocol, scenario.radio.preamble_symbols, scheduled_s or ranging.scheduled_s, ranging.reply.median_s
     )
 
 

@@ -231,11 +231,6 @@ class Ranging(Section):
         """Return the delay of the scheduled message in seconds."""
         return self.response_delay_uus * UUS_S
 
-    @property
-    def at_once_s(self) -> float:
-        """Return the median latency of a reply at once, in seconds."""
-        return self.reply.median_s
-
     def air_s(self, preamble_symbols: int, tags: int) -> float:
         """Return the air time of an exchange; of a broadcast by one of so many tags."""
         if self.plan == "broadcast":
@@ -248,7 +243,7 @@ class Ranging(Section):
         A tag sends its broadcast as soon after the one before as it sends a reply.
         """
         if self.plan == "broadcast":
-            return 1 / (self.air_s(preamble_symbols, tags) + self.at_once_s)
+            return 1 / (self.air_s(preamble_symbols, tags) + self.reply.median_s)
         row = PROTOCOLS[self.protocol]
-        cost = exchange_costs(row, preamble_symbols, self.scheduled_s, self.at_once_s)
+        cost = exchange_costs(row, preamble_symbols, self.scheduled_s, self.reply.median_s)
         return 1 / (cost["duration_s"] + TURNAROUND_S)
