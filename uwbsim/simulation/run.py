@@ -29,7 +29,6 @@ from uwbsim.simulation.air import WEAK, Air, Outcomes, Schedule, Slots, schedule
 from uwbsim.simulation.timestamps import (
     Draws,
     draw,
-    one_departure,
     provenance,
     reported_broadcasts,
     reported_exchanges,
@@ -76,8 +75,7 @@ class Simulated(Contents):
     @property
     def planted(self) -> dict[str, Any]:
         """Return the planted values: `delays_ns` by tag, `bias_curve`, `sigma_curve`, `alpha_dbm`."""
-        planted: dict[str, Any] = self.meta["planted"]
-        return planted
+        return dict(self.meta["planted"])
 
     def save(self, path: str | os.PathLike[str], *, frames: Sequence[FrameRow] = (), force: bool = False) -> None:
         """Write a recording (.uwb); `frames` are the bytes of the boards, from `through_wire`.
@@ -150,7 +148,9 @@ def simulate(
     world, plan = World(scenario), schedule(scenario)
     medium, draws = Medium(scenario, world), draw(scenario, len(plan.start), len(protocol.messages))
     if broadcast:
-        draws = one_departure(draws, len(scenario.tags) - 1)
+        # All rows of a frame have the noise of one departure.
+        listeners = len(scenario.tags) - 1
+        draws = replace(draws, transmit=np.repeat(draws.transmit[::listeners], listeners, axis=0))
     slots = _slots(medium, world, protocol, plan, draws)
     outcomes = _executed(medium, world, protocol, slots, progress, contention=contention)
     begun, lost = np.array(outcomes.start, dtype=np.int64), np.array(outcomes.lost)

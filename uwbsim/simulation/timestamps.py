@@ -97,11 +97,6 @@ def draw(scenario: Scenario, count: int, messages: int) -> Draws:
     )
 
 
-def one_departure(draws: Draws, listeners: int) -> Draws:
-    """Return draws with the same noise of departure in all rows of a frame."""
-    return replace(draws, transmit=np.repeat(draws.transmit[::listeners], listeners, axis=0))
-
-
 def stamp(medium: Medium, protocol: RangingProtocol, begun: Schedule, draws: Draws) -> Stamped:
     """Return the stamps of exchanges that begin at known instants, message after message."""
     result = Stamped({}, [], [], draws)
