@@ -15,7 +15,7 @@ from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import truncate4
 from uwbsim.random_streams import stream
-from uwbsim.scenario.devices import GroupDelay, GroupDelayTable
+from uwbsim.scenario.devices import DirectionTable, GroupDelay, GroupDelayTable
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import AntennaTable, BiasTable, Radio, SigmaSpline, Spline
 
@@ -69,15 +69,12 @@ def antenna_gain_db(scenario: Scenario, phases: Floats, tags: Ints, direction: F
     deviation `shadowing_db`; `phases` (tags, harmonics) are from `shadowing_phases`.
     """
     radio = scenario.radio
+    azimuth = np.arctan2(direction[:, 1], direction[:, 0])
     if isinstance(radio.antenna, AntennaTable):
-        azimuth = np.degrees(np.arctan2(direction[:, 1], direction[:, 0]))
-        elevation = np.degrees(np.arcsin(np.clip(direction[:, 2], -1, 1)))
-        table = _interpolator(radio.antenna.azimuth_deg, radio.antenna.elevation_deg, radio.antenna.gain_db)
-        gain = np.asarray(table(np.column_stack([azimuth, elevation])))
+        gain = _interpolated(radio.antenna, np.degrees(azimuth), np.clip(direction[:, 2], -1, 1))
     else:
         gain = ANTENNAS[radio.antenna](np.hypot(direction[:, 0], direction[:, 1]))
     if radio.shadowing_db:
-        azimuth = np.arctan2(direction[:, 1], direction[:, 0])
         waves = np.cos(azimuth[:, None] * SHADOW_ORDERS + phases[tags]).sum(axis=1)
         gain = gain + radio.shadowing_db * waves * np.sqrt(2 / len(SHADOW_ORDERS))
     for place, tag in enumerate(scenario.tags):
@@ -88,9 +85,14 @@ def antenna_gain_db(scenario: Scenario, phases: Floats, tags: Ints, direction: F
     return gain
 
 
+def _interpolated(table: DirectionTable, azimuth_deg: Floats, sine: Floats) -> Floats:
+    """Return the values of a table at azimuths (n,) and elevations with these sines (n,)."""
+    return np.asarray(_interpolator(table)(np.column_stack([azimuth_deg, np.degrees(np.arcsin(sine))])))
+
+
 @lru_cache(maxsize=16)
-def _interpolator(azimuth_deg: tuple[float, ...], elevation_deg: tuple[float, ...], values: Any) -> Any:
-    return RegularGridInterpolator((azimuth_deg, elevation_deg), np.array(values))
+def _interpolator(table: DirectionTable) -> Any:
+    return RegularGridInterpolator((table.azimuth_deg, table.elevation_deg), np.array(getattr(table, table.quantity)))
 
 
 def group_delay_m(scenario: Scenario, tags: Ints, direction: Floats) -> Floats:
@@ -112,9 +114,7 @@ def _group_delay_cm(model: GroupDelay, direction: Floats) -> Floats:
     sine = np.clip(direction[:, 2], -1, 1)
     if isinstance(model, GroupDelayTable):
         # The azimuth of a turned board may be beyond the ends of the table, which are the same direction.
-        around = (np.degrees(azimuth) + 180) % 360 - 180
-        table = _interpolator(model.azimuth_deg, model.elevation_deg, model.delay_cm)
-        return np.asarray(table(np.column_stack([around, np.degrees(np.arcsin(sine))])))
+        return _interpolated(model, (np.degrees(azimuth) + 180) % 360 - 180, sine)
     around = np.zeros(len(azimuth))
     for wave, heights in ((np.cos, model.cosine_cm), (np.sin, model.sine_cm)):
         for order, height in enumerate(heights, start=1):
