@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.__main__ import row, timed
+from uwbsim import load, load_design, run_sweep, simulate
+from uwbsim.sweep.design import SweepDesign
 
 ROOT = Path(__file__).parents[1]
 TEST1 = ROOT / "scenarios" / "icra2023" / "test1.toml"
 SWEEP = """[sweep]
-scenario = "{scenario}"
+scenario = "icra2023/test1"
 protocols = ["ss-cfo", "ds"]
 ranges = 200_000
 seeds = {seeds}
@@ -28,7 +30,7 @@ seeds = {seeds}
 """
 
 CALIBRATIONS = """[sweep]
-scenario = "{scenario}"
+scenario = "icra2023/test1"
 kind = "calibrate"
 seeds = {seeds}
 [vary]
@@ -79,7 +81,6 @@ def plain() -> str:
 def full() -> str:
     """Return the same with motion, bias and noise by power, reflections, whole ticks and the transmission grid."""
     from uwbsim.protocols.conditions import conditions_of
-    from uwbsim.scenario.loading import load
 
     return _rate(conditions_of(load(TEST1, ["radio.tx_noise_ps=40"])))
 
@@ -99,10 +100,8 @@ def engines() -> tuple[np.ndarray, np.ndarray, float]:
     """
     from uwblink.protocols.table import PROTOCOLS
     from uwblink.twr import raw_range
-    from uwbsim import simulate
     from uwbsim.protocols.conditions import conditions_of, range_errors_m
     from uwbsim.protocols.prediction import predict
-    from uwbsim.scenario.loading import load
 
     settings = ["ranging.rate_hz=250", "run.duration_s=4000", "radio.tx_noise_ps=40"]
     scenario = load(TEST1, settings)
@@ -124,15 +123,17 @@ def variances() -> str:
     return f"{100 * abs(exact.var() / fast.var() - 1):.2f} %"
 
 
-def sweep(workers: str, seeds: str = "120") -> str:
-    """Return the duration of a sweep in seconds."""
-    from uwbsim.sweep.design import load_design
-    from uwbsim.sweep.runner import run_sweep
+def design(folder: str, text: str) -> SweepDesign:
+    """Return the design of a sweep from its text, which is written into a folder."""
+    path = Path(folder) / "plan.toml"
+    path.write_text(text)
+    return load_design(path)
 
+
+def sweep(workers: str, seeds: int = 120) -> str:
+    """Return the duration of a sweep in seconds."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "plan.toml"
-        path.write_text(SWEEP.format(scenario="icra2023/test1", seeds=seeds))
-        plan = load_design(path)
+        plan = design(folder, SWEEP.format(seeds=seeds))
         start = time.perf_counter()
         run_sweep(plan, Path(folder) / "out", workers=int(workers))
         return f"{time.perf_counter() - start:.2f}"
@@ -140,15 +141,8 @@ def sweep(workers: str, seeds: str = "120") -> str:
 
 def calibrations(workers: str, seeds: int = 40) -> str:
     """Return the processor time of a run with calibration, start of processes included, minus that of its flight."""
-    from uwbsim import simulate
-    from uwbsim.scenario.loading import load
-    from uwbsim.sweep.design import load_design
-    from uwbsim.sweep.runner import run_sweep
-
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "plan.toml"
-        path.write_text(CALIBRATIONS.format(scenario="icra2023/test1", seeds=seeds))
-        plan, before = load_design(path), _processor_time()
+        plan, before = design(folder, CALIBRATIONS.format(seeds=seeds)), _processor_time()
         run_sweep(plan, Path(folder) / "out", workers=int(workers))
         each = (_processor_time() - before) / seeds
     flight = load(TEST1, ["run.duration_s=10"])
@@ -170,13 +164,10 @@ def dask() -> str:
     from distributed import Client, LocalCluster
 
     from uwblink.protocols.table import PROTOCOLS
-    from uwbsim.sweep.design import load_design
     from uwbsim.sweep.executors import Work, run_chunk
 
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "plan.toml"
-        path.write_text(SWEEP.format(scenario="icra2023/test1", seeds=40))
-        plan = load_design(path)
+        plan = design(folder, SWEEP.format(seeds=40))
         rows = tuple(PROTOCOLS[name] for name in plan.protocols)
         work = Work(name=plan.scenario.stem, protocols=rows, ranges=plan.settings.ranges)
         _, once = run_chunk([plan.loaded(0)], work)
@@ -197,13 +188,9 @@ def dask() -> str:
 
 def memory(seeds: str) -> str:
     """Return the peak memory of a sweep in this process, in MB."""
-    from uwbsim.sweep.design import load_design
-    from uwbsim.sweep.runner import run_sweep
-
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "plan.toml"
-        path.write_text(SWEEP.format(scenario="icra2023/test1", seeds=int(seeds) // 2).replace("200_000", "20_000"))
-        run_sweep(load_design(path), Path(folder) / "out", workers=1)
+        plan = design(folder, SWEEP.format(seeds=int(seeds) // 2).replace("200_000", "20_000"))
+        run_sweep(plan, Path(folder) / "out", workers=1)
     return f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f}"
 
 
