@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 from calib.data.samples import stamped
 from uwblink.recording.antenna_delays import AntennaDelay, meta_of_delays
@@ -125,7 +126,9 @@ def flight(recipe: Recipe, seed: int, number: int = 0) -> tuple[Contents, dict[s
         np.concatenate([pose_ns[own] for own in still]),
         np.concatenate([np.full(len(pose_s[own]), name) for own, name in zip(still, names, strict=True)]),
         np.concatenate([place[own] for (place, _), own in zip(tracks, still, strict=True)]),
-        np.concatenate([_quaternions(turn)[own] for (_, turn), own in zip(tracks, still, strict=True)]),
+        np.concatenate(
+            [Rotation.from_matrix(turn[own]).as_quat() for (_, turn), own in zip(tracks, still, strict=True)]
+        ),
     )
     carried = [Tag(tag, name, tuple(arms[tag].tolist())) for tag, name in enumerate(names, 1)]
     known = {"delays_ns": {str(tag): float(delays_ns[tag]) for tag in range(1, tags + 1)}}
@@ -178,24 +181,6 @@ def _turn(angle: Floats, axis: int) -> Floats:
     sign = -1.0 if axis == 1 else 1.0
     found[:, other, one], found[:, one, other] = sign * np.sin(angle), -sign * np.sin(angle)
     return found
-
-
-def _quaternions(turn: Floats) -> Floats:
-    """Return unit quaternions (n, 4), the scalar last, of rotations (n, 3, 3)."""
-    m = turn
-    four = np.stack(
-        [
-            1 + m[:, 0, 0] - m[:, 1, 1] - m[:, 2, 2],
-            1 - m[:, 0, 0] + m[:, 1, 1] - m[:, 2, 2],
-            1 - m[:, 0, 0] - m[:, 1, 1] + m[:, 2, 2],
-            1 + m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2],
-        ],
-        axis=1,
-    )
-    size = 0.5 * np.sqrt(np.maximum(four, 0))
-    for k, (a, b) in enumerate(((2, 1), (0, 2), (1, 0))):
-        size[:, k] = np.copysign(size[:, k], m[:, a, b] - m[:, b, a])
-    return size
 
 
 def _room(boards: np.random.Generator, first: Floats, second: Floats, ends: Any, which: Any) -> Floats:
