@@ -89,7 +89,7 @@ def parser_of(known: ColumnMap) -> Callable[[Sequence[str]], list[PrintedRange]]
         ]
 
     def number(text: str) -> int | str:
-        return (known.ids | numbers_of([text])).get(text, text)
+        return (numbers_of([text]) | known.ids).get(text, text)
 
     return parse
 

@@ -191,7 +191,7 @@ def _other_rows(exchanges: Exchanges, block: Columns) -> Iterator[tuple[str, Col
 
 def _note_assumptions(staging: Staging) -> None:
     """Add notes on ids that are words, on rows without a range, and on times that are assumed."""
-    if names := staging.names:
+    if names := {number: name for number, name in staging.names.items() if name not in staging.column_map.ids}:
         # The first dozen; the recording has all, as bodies of its tags.
         some = first_few((f"{name[:20]} = {number}" for number, name in names.items()), 12)
         staging.notes.append(

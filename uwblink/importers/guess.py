@@ -231,7 +231,7 @@ def _numbered(path: Path, table: SourceTable) -> Guess:
     wanted = ("time_s", *IDS, "range_m")
     why = "write the number of the column, or delete the line; constants are for what the table lacks"
     lines = _lines({name: (ASKED, why if name == wanted[0] else "") for name in wanted})
-    head = f"# {json.dumps(path.name)} has no header; the columns of its first row are: {json.dumps(first)[1:-1]}"
+    head = f"# {_toml(path.name)} has no header; the columns of its first row are: {_toml(first)[1:-1]}"
     return Guess("\n".join([head, "[columns]", *lines]) + "\n", True, wanted)
 
 
@@ -288,7 +288,7 @@ def _proposal(
     lacking += ["message"] if layout == "messages" and "message" in words & cells.keys() else []
     unplaced = [name for name in POSITIONS if name not in columns]
     taken = {*used.values(), *(header for keys in registers.values() for header in keys.values())}
-    left = [json.dumps(name) for name in names if name not in taken and not form.line and not form.wide]
+    left = [_toml(name) for name in names if name not in taken and not form.line and not form.wide]
     remarks = {
         why: layout == "nothing",
         "antenna delays programmed into the devices are unknown: give them in [antenna_delays]": not undelayed,
@@ -323,9 +323,9 @@ def _named(
     if layout == "nothing" and not {*STAMPS} & used.keys():
         named["range_m"] = (ASKED, "write the column of the ranges; or delete this line, and name those of stamps")
     elif layout == "ranges" and "range_m" in named and (kinds := _kinds_of_range(used["range_m"], names)):
-        named["range_m"] = (ASKED, f"write the column that the device measured: {' or '.join(map(json.dumps, kinds))}")
+        named["range_m"] = (ASKED, f"write the column that the device measured: {' or '.join(map(_toml, kinds))}")
     if "gt_range_m" in words and "gt_range_m" in named:
-        missing = f"{json.dumps(used['gt_range_m'])} has no numbers: name a column, or delete the line"
+        missing = f"{_toml(used['gt_range_m'])} has no numbers: name a column, or delete the line"
         named["gt_range_m"] = (ASKED, missing)
     return named
 
@@ -333,7 +333,7 @@ def _named(
 def _text(path: Path, sections: Mapping[str, Entries], remarks: Iterable[str]) -> str:
     """Return a map as TOML, a section without a title first, and remarks below it."""
     # Names of files can have line breaks, which would end the comment.
-    lines = [f"# {json.dumps(path.name)}, as it would be read; every line can be changed"]
+    lines = [f"# {_toml(path.name)}, as it would be read; every line can be changed"]
     for title, entries in sections.items():
         lines += [*(["", f"[{title}]"] if title else []), *_lines(entries)] if entries else []
     return "\n".join([*lines, "", *(f"# {text}" for text in remarks), ""])
@@ -353,8 +353,9 @@ def _lines(entries: Entries) -> list[str]:
 
 def _toml(value: Any) -> str:
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{key} = {json.dumps(one)}' for key, one in value.items())}}}"
-    return json.dumps(value)
+        return f"{{{', '.join(f'{key} = {_toml(one)}' for key, one in value.items())}}}"
+    # JSON may write a letter as two surrogates, which TOML does not have.
+    return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in json.dumps(value, ensure_ascii=False))
 
 
 StampEntries = tuple[Entries, tuple[str, str], bool]
@@ -450,7 +451,7 @@ def _map_of_bag(path: Path) -> Guess:
                 except ImportTableError as error:
                     # Most topics have other data; only a type without definition may contain ranges.
                     why = str(error) if "has no definition" in str(error) else why
-    listed = [f"{json.dumps(topic)} ({kind})" for topic, kind in kinds.items()]
+    listed = [f"{_toml(topic)} ({kind})" for topic, kind in kinds.items()]
     if not found:
         raise ImportTableError(f"{path}: no topic with ranges was recognised in {first_few(listed, 20)}; {why}")
     best, chosen = max(
@@ -464,10 +465,10 @@ def _map_of_bag(path: Path) -> Guess:
             "survey`); a flight also needs attitudes, and anchors or first positions (calib.fit_from_ranges); "
             "constants of pairs need true distances (docs/without-motion-capture.md)"
         )
-    others = [json.dumps(topic) for _, some in found if some is not chosen for topic in some]
+    others = [_toml(topic) for _, some in found if some is not chosen for topic in some]
     remarks = ["topics of the bag:", *(f"  {one}" for one in listed)]
     remarks += [f"other topics with ranges, which need their own maps: {', '.join(others)}"] if others else []
-    remarks += [f"poses, for `uwblink poses`: {first_few(map(json.dumps, poses))}"] if poses else []
+    remarks += [f"poses, for `uwblink poses`: {first_few(map(_toml, poses))}"] if poses else []
     text = best.text + "".join(f"# {line}\n" for line in (*remarks, advice) if line)
     return replace(best, text=text, importer="bag", pose_topics=tuple(poses), advice=advice)
 
@@ -490,7 +491,7 @@ def _guess_topics(bag: Bag, pattern: str, topics: list[str], table: Path) -> Gue
         table.write_text("".join(f"{line}\n" for line in lines), "utf-8")
     guess = _map_of_table(bag.path, table, ids[topics[0]], {"data": "range"} if re.fullmatch(_NUMBERS, kind) else {})
     sections = [
-        "\n".join([f"[topics.{json.dumps(topic)}]", *(f"{name} = {json.dumps(v)}" for name, v in values.items()), ""])
+        "\n".join([f"[topics.{_toml(topic)}]", *(f"{name} = {_toml(v)}" for name, v in values.items()), ""])
         for topic, values in stated.items()
     ]
     return replace(guess, text=f"{guess.text}\n# {len(topics)} topics of {kind}\n{''.join(sections)}\n")

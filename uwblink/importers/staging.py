@@ -217,12 +217,11 @@ class Staging:
         }
 
     def _number_words(self, words: list[str]) -> dict[str, int]:
-        """Return the number of each id: the id itself, the map's number, or else the next free one in alphabetical
+        """Return the number of each id: the map's number, the id itself, or else the next free one in alphabetical
         order.
         """
-        numbers = numbers_of(words)
-        if len(numbers) < len(words):
-            numbers = numbers | self.column_map.ids
+        numbers = numbers_of(words) | self.column_map.ids
+        if not numbers.keys() >= set(words):
             free = iter(sorted({*range(1, LARGEST_ID + 1)} - {*numbers.values()}))
             numbers |= dict(zip((word for word in words if word not in numbers), free, strict=False))
         if not numbers.keys() >= set(words):

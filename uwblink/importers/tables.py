@@ -79,11 +79,15 @@ class Dialect(NamedTuple):
 
 
 def _decoded(raw: bytes) -> tuple[str, str]:
-    """Return the text of the first bytes of a file, and its encoding as DuckDB calls it."""
+    """Return the text of the first bytes of a file, and its encoding as DuckDB calls it; raises `UnicodeDecodeError`
+    for bytes that are control characters in Latin-1.
+    """
     try:
         # A letter of several bytes may be cut at the end, which this decoder waits for.
         return codecs.getincrementaldecoder("utf-8-sig")().decode(raw), "utf-8"
     except UnicodeDecodeError:
+        if re.search(rb"[\x80-\x9f]", raw):
+            raise
         return raw.decode("latin-1"), "latin-1"
 
 

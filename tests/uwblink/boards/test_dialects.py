@@ -94,10 +94,10 @@ def test_a_map_of_lines_serves_as_for_logs_and_a_stream_is_corrected(tmp_path):
 
 
 def test_maps_have_the_same_effect_for_boards_and_logs(tmp_path):
-    """Units of a position, a constant initiator, ids of words, values without a range, and the sign of powers."""
+    """Units of a position, a constant initiator, numbers of ids, values without a range, and the sign of powers."""
     keys = 'line = "{to_id} {range_mm} {rxp2}"\nmissing = [65535]\n[units]\npower = "-dBm"\n[constants]\nfrom_id = 9\n'
-    lines = "left 1500 80.5\nright 2500 81.5\nright 65535 99.0\n"
-    logged = imported(tmp_path, lines, f"{keys}[ids]\nleft = 40\nright = 41\n", "board.log").exchanges
+    lines = "left 1500 80.5\n7 2500 81.5\n7 65535 99.0\n"
+    logged = imported(tmp_path, lines, f'{keys}[ids]\nleft = 40\n"7" = 41\n', "board.log").exchanges
     with printing(lines) as port:
         words = ("--dialect", "map.toml", "--duration", "1.0", "-o", "r.uwb")
         succeed("uwblink", "record", port, *words, cwd=tmp_path)

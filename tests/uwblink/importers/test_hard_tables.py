@@ -87,6 +87,7 @@ def endless():
             ("deep JSON", "t.jsonl", b"[" * 100_000 + b"\n", ""),
             ("no gzip", "t.csv.gz", b"no", ""),
             ("UTF-16", "t.csv", b"\xff\xfe\x00", ""),
+            ("neither UTF-8 nor Latin-1", "t.csv", b"time_s,\x80\n0,1\n", "UTF-8"),
             ("nothing", "t.csv", b"\n", ""),
             ("columns", "t.csv", ",".join(NAMES) + "\n" + ",".join(["1"] * 5000) + "\n", ""),
             ("fields", "t.jsonl", "{" + ", ".join(f'"{name}": 1' for name in NAMES) + "}\n", ""),
@@ -118,10 +119,13 @@ class StrangeError(Exception):
     """An error class that only a plug-in has."""
 
 
-@pytest.mark.parametrize("rows", [3, 3000], ids=["short", "long"])  # a long one is read further than its form
-def test_a_table_in_latin_1_keeps_the_letters_of_columns_and_devices(tmp_path, rows):
-    table = "Zeit [s];Sender;Empfänger;Entfernung [m];Pegel [dBm]\n" + "0,5;Gerät 1;Straße;3,25;-81,5\n" * rows
-    (tmp_path / "r.csv").write_text(table, "latin-1")
+# The form of a table is that of its first 64 KiB.
+@pytest.mark.parametrize(
+    ("encoding", "time", "rows"), [("latin-1", "Zeit", 3), ("latin-1", "Zeit", 3000), ("utf-8", "🕒 Zeit", 3)]
+)
+def test_a_table_keeps_the_letters_of_columns_and_devices(tmp_path, encoding, time, rows):
+    table = f"{time} [s];Sender;Empfänger;Entfernung [m];Pegel [dBm]\n" + "0,5;Gerät 1;Straße;3,25;-81,5\n" * rows
+    (tmp_path / "r.csv").write_text(table, encoding)
     guessed = guess_map(tmp_path / "r.csv")
     (tmp_path / "map.toml").write_text(guessed.text)
     import_recording(tmp_path / "r.csv", tmp_path / "r.uwb", map_file=tmp_path / "map.toml")
