@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from calib.errors import BadInputError
 from uwblink.settings import setting
-from uwblink.text_files import TomlReader
+from uwblink.text_files import TomlReader, is_number, number_in
 
 if TYPE_CHECKING:
     from uwblink import KnownDistance
@@ -68,10 +68,6 @@ def is_tag(value: object) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool) and 0 <= int(value) < 2**16
 
 
-def _is_finite(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-
-
 def read_scale(text: str) -> float | None:
     """Return a scale in nanoseconds from a text, None for "auto"; raises `BadInputError` for other words."""
     if text == "auto":
@@ -87,10 +83,7 @@ def read_fixed(texts: Iterable[str]) -> dict[int, float]:
     fixed: dict[int, float] = {}
     for text in texts:
         tag, equals, value = text.partition("=")
-        try:
-            delay = float(value)
-        except ValueError:
-            delay = math.nan
+        delay = number_in(value)
         if not (equals and tag.strip().isdecimal() and math.isfinite(delay)):
             raise BadInputError(f"found {text!r}, expected TAG=NS, as in 1=-0.36", parameter="fixed_ns")
         if int(tag) in fixed:
@@ -127,11 +120,11 @@ class CheckedSettings:
             stated = NUMBERS.get(name) if bounds is None else (*bounds, "{:g} to {:g}".format(*bounds))
             if stated and (value is not None or one.default is not None):
                 least, most, expected = stated
-                if not (_is_finite(value) and least <= value <= most):
+                if not (is_number(value) and least <= value <= most):
                     raise BadInputError(f"found {value!r}, expected {expected}", parameter=name)
             if name == "fixed_ns":
                 for tag, delay in (value or {}).items():
-                    if not (is_tag(tag) and _is_finite(delay)):
+                    if not (is_tag(tag) and is_number(delay)):
                         raise BadInputError(
                             f"found {tag!r}: {delay!r}, expected a tag id and its delay in ns", parameter=name
                         )
