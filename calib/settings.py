@@ -56,6 +56,13 @@ def check_choice(parameter: str, value: str, allowed: Iterable[str]) -> None:
         raise BadInputError(f"found {value!r}, allowed: {', '.join(allowed)}", parameter=parameter)
 
 
+def refuse(rows: Iterable[tuple[str, object, str]]) -> None:
+    """Raise `BadInputError` for the first row that is wrong: the name of a parameter, whether it is, and the text."""
+    for parameter, is_wrong, text in rows:
+        if is_wrong:
+            raise BadInputError(text, parameter=parameter)
+
+
 def check_tag(tag: object) -> None:
     """Raise `BadInputError` unless a value can be the id of a tag."""
     if not is_tag(tag):
@@ -289,40 +296,35 @@ class FitSettings(CheckedSettings):
         """Check the settings, except the name of the loss, which the fit checks."""
         CheckedSettings.__post_init__(self)
         beside = self.excludes_patterns
-        clashes: list[tuple[object, str, str]] = [
-            (
-                self.fold != "time" and not self.hold_out,
-                "fold",
-                f"{self.fold} has no effect without `hold_out`; set the share to hold out",
-            ),
-            (
-                self.sequential and self.loss == "mixture",
-                "sequential",
-                "a sequential fit needs a robust loss, not the mixture; remove one of the two settings",
-            ),
-            (
-                self.scale_ns is not None and self.fitted_loss == "mixture",
-                "scale_ns",
-                "a scale has no effect on the mixture; choose a robust loss, such as cauchy",
-            ),
-            (self.delays_only and self.groups, "groups", "has no effect without a curve (`delays_only`)"),
-            (
-                self.use == "receptions" and beside != "use",
-                "use",
-                f"receptions cannot be fitted with `{beside}`",
-            ),
-            *(
+        refuse(
+            [
                 (
-                    mode in ("shared", "tag") and beside,
-                    name,
-                    f"{mode} cannot be fitted with `{beside}`",
-                )
-                for name, mode in (("pattern", self.pattern), ("temperature", self.temperature))
-            ),
-        ]
-        for is_clash, parameter, why in clashes:
-            if is_clash:
-                raise BadInputError(why, parameter=parameter)
+                    "fold",
+                    self.fold != "time" and not self.hold_out,
+                    f"{self.fold} has no effect without `hold_out`; set the share to hold out",
+                ),
+                (
+                    "sequential",
+                    self.sequential and self.loss == "mixture",
+                    "a sequential fit needs a robust loss, not the mixture; remove one of the two settings",
+                ),
+                (
+                    "scale_ns",
+                    self.scale_ns is not None and self.fitted_loss == "mixture",
+                    "a scale has no effect on the mixture; choose a robust loss, such as cauchy",
+                ),
+                ("groups", self.delays_only and self.groups, "has no effect without a curve (`delays_only`)"),
+                (
+                    "use",
+                    self.use == "receptions" and beside != "use",
+                    f"receptions cannot be fitted with `{beside}`",
+                ),
+                *(
+                    (name, mode in ("shared", "tag") and beside, f"{mode} cannot be fitted with `{beside}`")
+                    for name, mode in (("pattern", self.pattern), ("temperature", self.temperature))
+                ),
+            ]
+        )
         seen: dict[int, str] = {}
         for name, tags in (self.groups or {}).items():
             listed = list(tags) if isinstance(tags, Iterable) and not isinstance(tags, str) else []

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 from calib.errors import BadInputError
-from calib.settings import CheckedSettings, check_choice
+from calib.settings import CheckedSettings, check_choice, refuse
 from uwblink.display import first_few
 from uwblink.settings import setting
 
@@ -33,17 +33,6 @@ def read_whole(text: str, parameter: str | None = None) -> list[int]:
     if not found or not all(math.isfinite(value) and value == int(value) for value in found):
         raise BadInputError(f"found {text!r:.40}, expected whole numbers with commas", parameter=parameter)
     return [int(value) for value in found]
-
-
-def _refuse(settings: CheckedSettings, refused: Iterable[tuple[str, Any, str]]) -> None:
-    """Raise `BadInputError` for the first wrong setting.
-
-    A row of `refused` has the name of a setting, its wrong part (false if nothing is wrong), and a text with fields for
-    the value and the wrong part.
-    """
-    for name, wrong, text in refused:
-        if wrong:
-            raise BadInputError(text.format(getattr(settings, name, ""), wrong), parameter=name)
 
 
 def _are_lengths(size_m: Sequence[float], dimensions: int) -> bool:
@@ -115,14 +104,23 @@ class SurveyPlanSettings(CheckedSettings):
         on_line = "anchors need a plane or space; on a line give the number of measured distances"
         wrong_size = self.size_m is not None and not _are_lengths(self.size_m, self.dimensions)
         several = 2 <= len(tags) <= 30 and len(set(tags)) == len(tags)
-        strangers = [tag for tag in sorted(self.anchors) if tags and tag not in tags]
-        refused = [
-            ("boards", tags and not several, f"found {first_few(map(str, tags))}, expected 2 to 30 boards, each once"),
-            ("anchors", strangers, "{1[0]} is none of the boards"),
-            ("anchors", self.anchors and self.on == "line", on_line),
-            ("size_m", wrong_size, f"found {{}}, expected as many lengths in metres as dimensions, {self.dimensions}"),
-        ]
-        _refuse(self, refused)
+        strangers = [tag for tag in self.anchors if tags and tag not in tags]
+        refuse(
+            [
+                (
+                    "boards",
+                    tags and not several,
+                    f"found {first_few(map(str, tags))}, expected 2 to 30 boards, each once",
+                ),
+                ("anchors", strangers, f"{min(strangers, default=0)} is none of the boards"),
+                ("anchors", self.anchors and self.on == "line", on_line),
+                (
+                    "size_m",
+                    wrong_size,
+                    f"found {self.size_m}, expected as many lengths in metres as dimensions, {self.dimensions}",
+                ),
+            ]
+        )
 
     @property
     def dimensions(self) -> int:
@@ -202,28 +200,33 @@ class FlightPlanSettings(CheckedSettings):
             f"found {self.robots!r:.60}, expected robots with a tag or more each, every tag once, at most {most_tags}"
         )
         others = len(set(anchors)) == len(anchors) and not set(anchors) & set(tags)
-        refused = [
-            ("size_m", not _are_lengths(self.size_m, 3), "found {}, expected three lengths in metres"),
-            (
-                "seconds",
-                known and ranges > most_ranges,
-                f"{ranges:.0f} ranges are too many for a plan; at most {most_ranges} are allowed",
-            ),
-            (
-                "still_s",
-                known and self.still_s > self.seconds / 2,
-                f"found {{}}, expected at most half of the {self.seconds:g} s",
-            ),
-            ("robots", known and not (robots and all(robots) and once), among),
-            ("anchors", not others, "found {}, expected other tags than those of robots"),
-            ("robots", len(robots) == 1 and not anchors, "a single robot without anchors has no partner for ranges"),
-            (
-                "robots",
-                not all(0 < tag < 65536 for tag in (*tags, *anchors)),
-                "found an id below 1, expected ids of 1 or more",
-            ),
-        ]
-        _refuse(self, refused)
+        refuse(
+            [
+                ("size_m", not _are_lengths(self.size_m, 3), f"found {self.size_m}, expected three lengths in metres"),
+                (
+                    "seconds",
+                    known and ranges > most_ranges,
+                    f"{ranges:.0f} ranges are too many for a plan; at most {most_ranges} are allowed",
+                ),
+                (
+                    "still_s",
+                    known and self.still_s > self.seconds / 2,
+                    f"found {self.still_s}, expected at most half of the {self.seconds:g} s",
+                ),
+                ("robots", known and not (robots and all(robots) and once), among),
+                ("anchors", not others, f"found {anchors}, expected other tags than those of robots"),
+                (
+                    "robots",
+                    len(robots) == 1 and not anchors,
+                    "a single robot without anchors has no partner for ranges",
+                ),
+                (
+                    "robots",
+                    not all(0 < tag < 65536 for tag in (*tags, *anchors)),
+                    "found an id below 1, expected ids of 1 or more",
+                ),
+            ]
+        )
         object.__setattr__(self, "robots", robots if known else None)
 
     @property

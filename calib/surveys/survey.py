@@ -28,7 +28,7 @@ from calib.data.samples import ANCHOR_DELAYS_NS
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.findings import BUDGET, Finding, warning
-from calib.settings import SurveySettings
+from calib.settings import SurveySettings, refuse
 from calib.surveys.knowledge import Knowledge, check_knowledge, load_knowledge
 from calib.surveys.network import DIMENSIONS, Boards, CurvePrior, Network
 from calib.surveys.outcome import in_frames, result_of, widened_by
@@ -265,17 +265,18 @@ def network_of(gathered: SurveyData, knowledge: Knowledge, fixed_ns: Mapping[int
         heights = {
             p.position_m[2] for p in knowledge.positions if p.arrangement in ("", one.name) and p.tag in boards.tags
         }
-        for wrong, text in (
-            (heights and boards.dimensions == 1, "known positions need a plane or space; on a line give distances"),
-            (
-                len(heights) > 1 and boards.dimensions == 2,
-                "the plane is that of x and y, but its positions differ in z",
-            ),
-            (set(order) - set(tags[k]), "its order of boards has a tag without ranges there"),
-            (len(set(order)) < len(order), "its order of boards has a tag twice"),
-        ):
-            if wrong:
-                raise BadInputError(f"{one.name}: {text}", parameter="known")
+        refuse(
+            ("known", wrong, f"{one.name}: {text}")
+            for wrong, text in (
+                (heights and boards.dimensions == 1, "known positions need a plane or space; on a line give distances"),
+                (
+                    len(heights) > 1 and boards.dimensions == 2,
+                    "the plane is that of x and y, but its positions differ in z",
+                ),
+                (set(order) - set(tags[k]), "its order of boards has a tag without ranges there"),
+                (len(set(order)) < len(order), "its order of boards has a tag twice"),
+            )
+        )
         arrangements.append(boards)
     return Network(
         means=replace(means, arrangement=np.searchsorted(used, means.arrangement)),
