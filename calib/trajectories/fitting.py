@@ -323,10 +323,7 @@ def with_known_distances(information: Matrix, layout: Layout, own: Ints) -> Floa
     `information` (p, p) is that of ranges and priors; the unknowns of motion are held.
     """
     others = np.setdiff1d(layout.free(), layout.indices(list(MOTION)))
-    some = information[others][:, others]
-    dense = some.toarray() if sparse.issparse(some) else some
-    place = np.searchsorted(others, own)
-    return np.asarray(inverse_of(dense, np.arange(len(others)))[:, place])[place]
+    return np.asarray(inverse_of(information, others)[:, own][own])
 
 
 def verdict_on(covariance: Floats, with_truth: Floats, tags: Sequence[int]) -> Verdict:
