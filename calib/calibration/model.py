@@ -497,6 +497,18 @@ def given_calibration(source: CalibrationSource, parameter: str = "calibration")
     return known
 
 
+def given_curve(source: CalibrationSource | None) -> Calibration | None:
+    """Return the calibration whose curve the argument `curve_from` asks to use, None without one.
+
+    Raises `BadInputError` where it has no single curve of all exchanges, and the errors of `given_calibration`.
+    """
+    known = None if source is None else given_calibration(source, "curve_from")
+    if known is not None and (known.groups or known.power_at != "exchange"):
+        what = "curves of groups of tags" if known.groups else "a curve of each reception"
+        raise BadInputError(f"has {what}, expected one curve of all exchanges", parameter="curve_from")
+    return known
+
+
 def _tables(calibration: Calibration) -> dict[str, list[tuple[str, ...]]]:
     """Return the tables of a calibration by title; those without rows are left out."""
     bodies = {

@@ -21,7 +21,7 @@ import numpy as np
 from scipy import special
 from threadpoolctl import threadpool_limits
 
-from calib.calibration.model import Calibration, given_calibration
+from calib.calibration.model import Calibration, given_curve
 from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.data.ranges import Ranges
 from calib.data.samples import ANCHOR_DELAYS_NS
@@ -226,14 +226,14 @@ def _knowledge(known: Knowledge | str | os.PathLike[str]) -> Knowledge:
 def _checked_curve(curve_from: Calibration | str | os.PathLike[str] | None) -> Calibration | None:
     """Return the calibration whose curve is used.
 
-    Raises `BadInputError` for a calibration with another lifting, or without a curve.
+    Raises `BadInputError` for a calibration with another lifting, or without one curve of all exchanges.
     """
-    known = None if curve_from is None else given_calibration(curve_from, "curve_from")
-    if known is not None and (known.lift != LIFT or known.alpha_dbm != ALPHA_DBM):
-        text = f"its power is {known.lift} above {known.alpha_dbm:g} dBm, expected {LIFT} above {ALPHA_DBM:g} dBm"
-        raise BadInputError(text, parameter="curve_from")
-    if known is not None and known.bias_curve.flat:
-        raise BadInputError("it has no curve over power", parameter="curve_from")
+    known = given_curve(curve_from)
+    if known is not None:
+        differs = known.lift != LIFT or known.alpha_dbm != ALPHA_DBM
+        power = f"its power is {known.lift} above {known.alpha_dbm:g} dBm, expected {LIFT} above {ALPHA_DBM:g} dBm"
+        flat = known.bias_curve.flat
+        refuse([("curve_from", differs, power), ("curve_from", flat, "it has no curve over power")])
     return known
 
 

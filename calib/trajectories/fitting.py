@@ -12,7 +12,7 @@ from scipy import sparse
 from threadpoolctl import threadpool_limits
 
 from calib.calibration.document import Split, reading_provenance
-from calib.calibration.model import Calibration, given_calibration, matrix_of
+from calib.calibration.model import Calibration, given_curve, matrix_of
 from calib.calibration.power_curves import basis
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import refuse_refuted
@@ -113,14 +113,11 @@ def _settings(
     for name in settings.changed():
         if name not in COMMON_SETTINGS:
             raise BadInputError("can only be used with known distances", parameter=name)
-    if flight.curve_from is None:
+    known = given_curve(flight.curve_from)
+    if known is None:
         return flight, settings, None
-    known = given_calibration(flight.curve_from, "curve_from")
     if other := "delays_only" if settings.delays_only else "groups" if settings.groups else "":
         raise BadInputError(f"gives the curve of all tags, and cannot be used with `{other}`", parameter="curve_from")
-    if known.groups or known.power_at != "exchange":
-        what = "curves of groups of tags" if known.groups else "a curve of each reception"
-        raise BadInputError(f"has {what}, expected one curve of all exchanges", parameter="curve_from")
     with reading_provenance():
         reference = float(known.provenance.get("reference_power_dbm", known.alpha_dbm))
     kept = replace(settings, lift=known.lift, alpha_dbm=known.alpha_dbm, reference_power_dbm=reference)

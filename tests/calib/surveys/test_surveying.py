@@ -522,6 +522,7 @@ def test_unusable_curves_are_refused(surveyed):
         (calib.UnanswerableError, {"curve_from": flight}, "some pairs have no power"),
         (calib.BadInputError, {"curve_from": flight, "delays_only": True}, "cannot be used with `delays_only`"),
         (calib.BadInputError, {"curve_from": replace(flight, alpha_dbm=-80.0)}, "its power is"),
+        (calib.BadInputError, {"curve_from": replace(flight, power_at="reception")}, "a curve of each reception"),
     ):
         with pytest.raises(refused, match=message):
             calib.survey(ranges, known="line", **settings)
