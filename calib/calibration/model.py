@@ -46,7 +46,7 @@ from calib.calibration.document import (
 )
 from calib.calibration.error_model import CheckedErrors
 from calib.calibration.patterns import CheckedPattern, CheckedSlope, dependences_m
-from calib.calibration.power_curves import LIFTS, BiasCurve, SigmaCurve, basis, lifted_power
+from calib.calibration.power_curves import LIFTS, BiasCurve, SigmaCurve, lifted_power
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.findings import Finding
@@ -392,7 +392,7 @@ class Calibration:
             return None
         curve = self.bias_curve if which == "bias" else self.sigma_curve
         covariance = self.curve_covariance_m2 if which == "bias" else np.array(self.uncertainty.sigma_m2)
-        splines = basis(np.clip(lifted, *curve.range), np.array(curve.knots))
+        splines = curve.splines(lifted)
         return np.asarray(np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", splines, covariance, splines), 0)))
 
     def to_json(self) -> str:

@@ -73,6 +73,11 @@ class Curve:
         spline = BSpline.construct_fast(knots, coefficients, self.degree)
         return np.asarray(spline(np.clip(lifted, *self.range)))
 
+    def splines(self, lifted: Floats) -> Floats:
+        """Return the B-splines (n, m) at lifted powers (n,): the curve is their product with the coefficients."""
+        inside, knots = np.clip(lifted, *self.range), np.array(self.knots)
+        return np.asarray(BSpline.design_matrix(inside, knots, self.degree, extrapolate=True).toarray())
+
     @property
     def flat(self) -> bool:
         """Whether the curve does not depend on power."""

@@ -12,7 +12,7 @@ import numpy as np
 import uwblink
 from calib.calibration.error_model import ErrorModel
 from calib.calibration.model import Calibration, Uncertainty, matrix_of
-from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis, flat_curve
+from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, flat_curve
 from calib.errors import UnanswerableError
 from calib.estimator.range_model import METRES_A_NS
 from calib.estimator.to_calibration import BETWEEN_M, variance_of_delays
@@ -215,11 +215,11 @@ def _with_errors(calibration: Calibration, errors: ErrorModel | None, between_m:
     """
     if errors is None:
         return calibration
-    tags, curve = list(calibration.delays_ns), calibration.bias_curve
+    tags = list(calibration.delays_ns)
     corrected = ends[np.isin(ends, tags).all(axis=1)]
     # There may be no such pair.
     variance = variance_of_delays(corrected, tags, calibration.covariance_ns2(tags)).sum() / max(len(corrected), 1)
-    splines = basis(np.clip(errors.lifted, *curve.range), np.array(curve.knots))
+    splines = calibration.bias_curve.splines(np.array(errors.lifted))
     of_curve = np.sum(splines @ calibration.curve_covariance_m2 * splines, axis=1)
     return replace(calibration, errors=errors.between(between_m, np.sqrt(variance + of_curve)))
 
@@ -227,7 +227,7 @@ def _with_errors(calibration: Calibration, errors: ErrorModel | None, between_m:
 def widened_by(found: Solution, curve: Calibration) -> Solution:
     """Return a solution whose covariance includes the effect of errors of a given curve on delays and places."""
     here, means = found.linear, found.network.means
-    splines = basis(np.clip(means.lifted, *curve.bias_curve.range), np.array(curve.bias_curve.knots))
+    splines = curve.bias_curve.splines(means.lifted)
     count = len(splines)
     gain = here.covariance @ (here.jacobian[:count].T @ (splines / here.std[:count, None]))
     return replace(found, more=found.more + gain @ curve.curve_covariance_m2 @ gain.T)

@@ -13,7 +13,6 @@ from threadpoolctl import threadpool_limits
 
 from calib.calibration.document import Split, reading_provenance
 from calib.calibration.model import Calibration, given_curve, matrix_of
-from calib.calibration.power_curves import basis
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import refuse_refuted
 from calib.data.sources import Data
@@ -160,7 +159,7 @@ def _fit_to_estimated_distances(model: RangeModel, top: Search, known: Calibrati
 
 def _curve_uncertainty(found: RangeFit, known: Calibration) -> Floats:
     """Return the covariance (tags, tags) in ns^2 that the uncertainty of a kept curve adds to the delays."""
-    splines = basis(np.clip(found.model.lifted, *known.bias_curve.range), np.array(known.bias_curve.knots))
+    splines = known.bias_curve.splines(found.model.lifted)
     # Derivatives of the unknowns by the coefficients: covariance times information.
     optimum, linked = found.slopes.optimum, found.slopes.link(sparse.csr_matrix(splines))
     reach = (optimum.covariance @ linked.T)[optimum.layout.where["delay"]]

@@ -92,6 +92,16 @@ def test_ranges_without_power_have_no_sigma_and_those_beyond_the_curve_a_larger_
     assert far.sigma_total_m > fitted.correct(3.0, -79.0, -79.0, 1, 2).sigma_total_m
 
 
+def test_the_band_of_a_polygon_is_that_of_its_corners(fitted):
+    """Files may have curves of another degree than fitted ones: halfway between corners, half of each counts."""
+    low, high = fitted.bias_curve.range
+    curve = replace(fitted.bias_curve, knots=(low, low, high, high), coefficients=(0.0, 0.1), degree=1)
+    uncertainty = replace(fitted.uncertainty, bias_m2=((4e-4, 0.0), (0.0, 1e-4)))
+    known = calib.Calibration.from_json(replace(fitted, bias_curve=curve, uncertainty=uncertainty).to_json())
+    band = known.band(np.array([0.0, low, (low + high) / 2, high]), "bias")
+    assert band == pytest.approx([0.02, 0.02, np.sqrt(5e-4) / 2, 0.01])
+
+
 @pytest.mark.parametrize("name", ["1-2", "2-1"])
 def test_factors_of_a_pair_hold_in_both_directions(fitted, name):
     errors = replace(fitted.errors, pairs={name: PairErrors(1.0, 3.0, 1.0)})
