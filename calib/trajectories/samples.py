@@ -17,8 +17,8 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation, Slerp
 
 from calib.data.sources import sensor_rows
-from calib.errors import BadInputError
 from calib.evaluation.filters import GRAVITY_M_S2
+from calib.settings import refuse
 from calib.spread import medians, robust_spread
 from uwblink.arrays import Bools, ColumnTable, Floats, Ints
 from uwblink.recording.schema import Arrangement, KnownDistance
@@ -129,8 +129,7 @@ def tapes_of(
     spans = {one.name: ((one.start_ns - began_ns) * 1e-9, (one.end_ns - began_ns) * 1e-9) for one in arrangements}
     rows, used, left_out = list[tuple[float, ...]](), list[KnownDistance](), list[str]()
     for one in stated:
-        if wrong := _unusable(one, bodies):
-            raise BadInputError(wrong, parameter="distances")
+        _refuse_unusable(one, bodies)
         times = _instants(one, spans, last_s)
         if {bodies[one.first], bodies[one.second]} <= set(still):
             times = [np.nan]
@@ -148,39 +147,41 @@ def tapes_of(
     return Tapes(time_s, whole[0], whole[1], distance_m, std, whole[2], tuple(used), tuple(left_out))
 
 
-def _unusable(one: KnownDistance, bodies: Mapping[int, str]) -> str:
-    """Return why a distance cannot be used, "" if it can."""
-    pair = f"tags {one.first} and {one.second}"
-    for tag in (one.first, one.second):
-        if tag not in bodies:
-            return f"found tag {tag}, the tags that range are {', '.join(map(str, sorted(bodies)))}"
-    if bodies[one.first] == bodies[one.second]:
-        return f"{pair} are on one body, so their lever arms determine the distance"
-    for value, what in ((one.distance_m, "distance"), (one.sigma_m, "standard error")):
-        if not (np.isfinite(value) and value > 0):
-            return f"found {value!r} as the {what} of {pair}, expected metres above 0"
-    return ""
+def _refuse_unusable(one: KnownDistance, bodies: Mapping[int, str]) -> None:
+    """Raise `BadInputError` for a distance that cannot be used."""
+    ends, pair = (one.first, one.second), f"tags {one.first} and {one.second}"
+    strangers = [tag for tag in ends if tag not in bodies]
+    tags = ", ".join(map(str, sorted(bodies)))
+    on_one = f"{pair} are on one body, so their lever arms determine the distance"
+    refuse(
+        [
+            *(("distances", True, f"found tag {tag}, the tags that range are {tags}") for tag in strangers),
+            ("distances", len({bodies.get(tag) for tag in ends}) == 1, on_one),
+            *(
+                (
+                    "distances",
+                    not (np.isfinite(value) and value > 0),
+                    f"found {value!r} as the {what} of {pair}, expected metres above 0",
+                )
+                for value, what in ((one.distance_m, "distance"), (one.sigma_m, "standard error"))
+            ),
+        ]
+    )
 
 
 def _instants(one: KnownDistance, spans: Mapping[str, tuple[float, float]], last_s: float) -> list[float]:
     """Return the seconds at which a distance between moving bodies has rows."""
     seconds = re.match(r"^\s*(\d+(?:\.\d*)?)\s*\.\.\s*(\d+(?:\.\d*)?)\s*$", one.arrangement)
-    if not one.arrangement:
-        chosen = list(spans.values())
-    elif one.arrangement in spans:
-        chosen = [spans[one.arrangement]]
-    elif seconds:
-        chosen = [(float(seconds[1]), float(seconds[2]))]
-    else:
-        raise BadInputError(
-            f"found the arrangement {one.arrangement!r:.40}, but the recording has {', '.join(spans) or 'none'}; or "
-            f"give seconds, as in 2..8",
-            parameter="distances",
-        )
+    known = ({one.arrangement: (float(seconds[1]), float(seconds[2]))} if seconds else {}) | dict(spans)
+    unknown = (
+        f"found the arrangement {one.arrangement!r:.40}, but the recording has {', '.join(spans) or 'none'}; or give "
+        f"seconds, as in 2..8"
+    )
+    refuse([("distances", one.arrangement not in ("", *known), unknown)])
     found = list[float]()
-    for start, end in chosen:
+    for name, (start, end) in known.items():
         begin_s, end_s = max(start, 0.0), min(end, last_s)
-        if begin_s <= end_s:
+        if one.arrangement in ("", name) and begin_s <= end_s:
             count = max(int((end_s - begin_s) / POINT_S), 1)
             found += np.linspace(begin_s, end_s, 2 * count + 1)[1::2].tolist()
     return found
