@@ -31,7 +31,7 @@ from calib.planning.settings import FlightPlanSettings
 from calib.range_errors.densities import error_slopes
 from calib.settings import FitSettings, FlightSettings
 from calib.spread import TWO_SIDED_95
-from calib.trajectories.fitting import range_model, variance_factor, verdict_on, with_known_distances
+from calib.trajectories.fitting import range_model, variance_factor, verdict_on
 from calib.trajectories.motion import LEAST_JERK, Distances, Motion, known_rows
 from calib.trajectories.samples import SAMPLE_S, TRUSTED, tapes_of
 from calib.trajectories.scene import Scene, scene_from
@@ -169,9 +169,10 @@ class Information:
             self.covariance = inverse_of(known, self.layout.free())
             if priors.update(self.x, self.covariance) < SETTLED:
                 break
-        with_truth = with_known_distances(of_ranges + priors.precision(), self.layout, self.delays)
         self.covariance_ns2 = self.covariance[:, self.delays][self.delays] * variance_factor(scene)
-        self.verdict = verdict_on(self.covariance_ns2, with_truth, self.tags)
+        self.verdict = verdict_on(
+            self.covariance_ns2, of_ranges + priors.precision(), self.layout, self.delays, self.tags
+        )
 
     def best_tape(self, still_s: float, sigma_m: float) -> tuple[int, int] | None:
         """Return the pair of tags whose taped distance reduces the variance of the delays most; None if none does.

@@ -268,7 +268,7 @@ def _judge_delays(found: RangeFit, top: Search) -> tuple[Ints, Verdict]:
     held = DELAY_NS * found.model.held[own]
     covariance = variance_factor(top.motion.scene) * found.covariances["delay"][np.ix_(own, own)] + held @ held.T
     tags = [found.model.tags[k] for k in own]
-    return own, verdict_on(covariance, with_known_distances(information, layout, unpinned), tags)
+    return own, verdict_on(covariance, information, layout, unpinned, tags)
 
 
 def _distance_std_m(top: Search) -> float:
@@ -313,26 +313,23 @@ def _undetermined_text(
     )
 
 
-def with_known_distances(information: Matrix, layout: Layout, own: Ints) -> Floats:
-    """Return the covariance (k, k) that some unknowns would have if all distances were known.
+def verdict_on(covariance: Floats, information: Matrix, layout: Layout, own: Ints, tags: Sequence[int]) -> Verdict:
+    """Return the verdict on the delays of `tags`, the unknowns `own` (tags,), with a covariance (tags, tags).
 
-    `information` (p, p) is that of ranges and priors; the unknowns of motion are held.
+    It is compared with the covariance that they would have if all distances were known: `information` (p, p) is that of
+    ranges and priors, and the unknowns of motion are held.
     """
-    others = np.setdiff1d(layout.free(), layout.indices(list(MOTION)))
-    return np.asarray(inverse_of(information, others)[:, own][own])
-
-
-def verdict_on(covariance: Floats, with_truth: Floats, tags: Sequence[int]) -> Verdict:
-    """Return the verdict on delays with a covariance (tags, tags), compared with that for known distances."""
     if not tags:
         return judge(np.eye(1) * 1e6, [InformationColumn("delay", "")])
+    others = np.setdiff1d(layout.free(), layout.indices(list(MOTION)))
+    with_truth = np.diag(inverse_of(information, others)[:, own][own])
     # `LOOSEST` of 0.2 ns is 3 cm of range; from simulations (docs/accuracy.md): wider intervals did not hold. If a fit
     # with known distances is less certain than this, the limit is three times its standard error.
-    guess = np.maximum(0.2, 3.0 / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
-    information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True)
-    information += np.eye(len(covariance)) / BOARD_DELAY_STD_NS**2
+    guess = np.maximum(0.2, 3.0 / LOOSEST * np.sqrt(np.maximum(with_truth, 0.0)))
+    known = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True)
+    known += np.eye(len(covariance)) / BOARD_DELAY_STD_NS**2
     unknowns = [InformationColumn("delay", str(tag), scale) for tag, scale in zip(tags, guess.tolist(), strict=True)]
-    return judge((information + information.T) / 2, unknowns)
+    return judge((known + known.T) / 2, unknowns)
 
 
 def _of_motion(top: Search) -> Iterator[Finding]:
