@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 from scipy import special
 
+import uwblink
 from uwblink.arrays import Floats
 
 BUDGET: Final = 0.01
@@ -197,10 +198,18 @@ class Check:
         ]
 
 
-def for_provenance(findings: Iterable[Finding]) -> dict[str, Any]:
-    """Return findings as a calibration states them: sentences, and the fault and the p-value of each in their order."""
+def for_provenance(
+    findings: Iterable[Finding], settings: Mapping[str, Any], fixed_ns: Mapping[int, float]
+) -> dict[str, Any]:
+    """Return what every calibration states: its writer, changed settings, known delays and findings.
+
+    Findings are sentences, and the fault and the p-value of each in their order.
+    """
     several = list(findings)
+    given = {"settings": settings, "fixed_ns": {str(tag): delay for tag, delay in sorted(fixed_ns.items())}}
     return {
+        "writer": f"uwbcal {uwblink.__version__}",
+        **{name: values for name, values in given.items() if values},
         "warnings": [str(one) for one in several],
         "findings": [{"fault": one.fault, "p_value": one.p_value} for one in several],
     }

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-import uwblink
 from calib.calibration.document import for_json, split_text
 from calib.calibration.error_model import lasting_errors
 from calib.calibration.model import Calibration, CalibrationSource, given_calibration
@@ -333,19 +332,14 @@ def result_of(
         *limits_of_data(ranges, float(np.mean(inliers)), found.blocks.seconds),
     ]
     provenance: dict[str, Any] = {
-        "writer": f"uwbcal {uwblink.__version__}",
         "exchanges": int(np.count_nonzero(~ranges.differences)),
         "inliers": int(np.count_nonzero(inliers)),
         "excluded": ranges.excluded,
         "converged": found.success,
         "standard_errors": f"sandwich over {found.persistence.stretches:.0f} independent stretches of time",
-        **for_provenance(findings),
+        **for_provenance(findings, settings.changed(), fixed),
         "error_std_m": {"raw": float(np.std(ranges.error_m)), "corrected": float(np.std(residuals))},
     }
-    if fixed:
-        provenance["fixed_ns"] = {str(tag): delay for tag, delay in sorted(fixed.items())}
-    if settings.changed():
-        provenance["settings"] = settings.changed()
     return FitResult(
         calibration=replace(calibration, provenance=calibration.provenance | provenance),
         ranges=ranges,

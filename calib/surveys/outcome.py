@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-import uwblink
 from calib.calibration.error_model import ErrorModel
 from calib.calibration.model import Calibration, Uncertainty, matrix_of
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, flat_curve
@@ -73,11 +72,11 @@ def result_of(
     reflected = tuple(_reflected_pairs(found))
     findings = (*data.limits, *findings, *_limits(found, second, verdict, reflected))
     arrangements = tuple(_arrangement(found, k) for k in range(len(network.arrangements)))
-    more = ({"settings": asked.changed()} if asked.changed() else {}) | {
+    more = {
         "surveyed": [one.to_dict() for one in arrangements],
         "reflected": [one.to_dict() for one in reflected],
         "second_best": None if second is None else round(second.worse, 2),
-        **for_provenance(findings),
+        **for_provenance(findings, asked.changed(), network.fixed_ns),
     }
     return SurveyResult(
         calibration=_with_errors(
@@ -167,9 +166,7 @@ def _calibration(
         curve = Curve(tuple(knots.tolist()), tuple(found.x[where].tolist()), DEGREE, span)
         curve_covariance = found.covariance()[where, where] * interval_factor(freedom) ** 2
         gauge = f"the bias curve is zero at {ALPHA_DBM:g} dBm; the delays contain the common constant"
-    fixed = {"fixed_ns": {str(tag): delay for tag, delay in sorted(network.fixed_ns.items())}}
-    provenance = (fixed if network.fixed_ns else {}) | {
-        "writer": f"uwbcal {uwblink.__version__}",
+    provenance = {
         "recordings": list(data.sources),
         "exchanges": int(network.means.count.sum()),
         "pairs": len(network.means.range_m),
