@@ -16,7 +16,7 @@ from scipy.interpolate import BSpline
 from calib.calibration.document import Split
 from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, knots_for, lift, lifted_power, populated
 from calib.data.ranges import Ranges
-from calib.errors import BadInputError, UnanswerableError
+from calib.errors import UnanswerableError
 from calib.estimator.covariates import COVARIATES, Covariate
 from calib.estimator.grouped_errors import ReflectionFeatures, error_unknowns, logarithms, scattered
 from calib.estimator.identifiability import free_directions
@@ -24,7 +24,7 @@ from calib.estimator.range_rows import Errors, Mixture, Part, RangeRows, block_o
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown
 from calib.pairs import Pairs, pairs_of_bodies
-from calib.settings import FitSettings
+from calib.settings import FitSettings, refuse
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -385,20 +385,30 @@ def _carrier(pairs: Pairs, tags: list[int], settings: FitSettings, group: tuple[
     return weights if left @ left < 1e-4 * (aim @ aim) else None
 
 
+def strangers(fixed_ns: Mapping[int, float], tags: Sequence[int]) -> Iterator[tuple[str, bool, str]]:
+    """Yield a row of `refuse` for each known delay of a tag without ranges."""
+    for tag in sorted(set(fixed_ns) - set(tags)):
+        yield "fixed_ns", True, f"found tag {tag}, the tags are {', '.join(map(str, tags))}"
+
+
 def _check_tags(ranges: Ranges, tags: list[int], settings: FitSettings) -> None:
     groups = settings.groups
-    unknown = sorted(set(settings.fixed_ns) - set(tags))
-    if unknown:
-        raise BadInputError(f"found tag {unknown[0]}, the tags are {', '.join(map(str, tags))}", parameter="fixed_ns")
     member = {tag for own in groups.values() for tag in own}
-    lonely = [tag for tag in tags if groups and tag not in member]
-    if lonely:
-        raise BadInputError(
-            f"tag {lonely[0]} is not in any group; the groups are {', '.join(groups)}", parameter="groups"
-        )
-    unused = [name for name, own in groups.items() if not set(own) & set(tags)]
-    if unused:
-        raise BadInputError(f"no tag of group {unused[0]!r} has ranges in {ranges.source}", parameter="groups")
+    refuse(
+        [
+            *strangers(settings.fixed_ns, tags),
+            *(
+                ("groups", True, f"tag {tag} is not in any group; the groups are {', '.join(groups)}")
+                for tag in tags
+                if groups and tag not in member
+            ),
+            *(
+                ("groups", True, f"no tag of group {name!r} has ranges in {ranges.source}")
+                for name, own in groups.items()
+                if not set(own) & set(tags)
+            ),
+        ]
+    )
 
 
 def _shares(ranges: Ranges, groups: Mapping[str, tuple[int, ...]]) -> list[tuple[str, Floats | None]]:

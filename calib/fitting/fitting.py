@@ -40,7 +40,7 @@ from calib.findings import Finding, for_provenance, warning
 from calib.fitting.covariates import drift_of, effects_of_supply, fit_with_covariates, with_new_tag
 from calib.fitting.passive_listeners import MIN_OF_DELAY
 from calib.fitting.result import FitResult, HeldOut
-from calib.settings import FitSettings, check_tag
+from calib.settings import FitSettings, check_tag, refuse
 from uwblink.arrays import Bools
 from uwblink.recording.antenna_delays import delays_differ, known_delays
 
@@ -209,22 +209,28 @@ def _ranges_of_new_tag(calibration: Calibration, tag: int, ranges: Ranges) -> Ra
 
     Raises the errors of `add_tag` for calibrations, tags and ranges that cannot be used.
     """
-    if calibration.pair_offsets:
-        raise BadInputError(
-            "has constants of pairs and no delays of tags; fit all recordings again", parameter="calibration"
-        )
-    if tag in calibration.delays_ns:
-        raise BadInputError(
-            f"the calibration already has a delay of tag {tag}; fit all recordings again to change it", parameter="tag"
-        )
+    tags = ranges.tags()
     differ = delays_differ(calibration.antenna_delays, ranges.antenna_delays, calibration.delays_ns)
-    if differ:
-        raise BadInputError(differ, parameter="calibration")
-    if tag not in ranges.tags():
-        raise BadInputError(
-            f"tag {tag} has no ranges in {ranges.source}; its tags are {', '.join(map(str, ranges.tags()))}",
-            parameter="tag",
-        )
+    refuse(
+        [
+            (
+                "calibration",
+                calibration.pair_offsets,
+                "has constants of pairs and no delays of tags; fit all recordings again",
+            ),
+            (
+                "tag",
+                tag in calibration.delays_ns,
+                f"the calibration already has a delay of tag {tag}; fit all recordings again to change it",
+            ),
+            ("calibration", differ, differ),
+            (
+                "tag",
+                tag not in tags,
+                f"tag {tag} has no ranges in {ranges.source}; its tags are {', '.join(map(str, tags))}",
+            ),
+        ]
+    )
     known = list(calibration.delays_ns)
     first, second = (np.isin(ends, known) for ends in (ranges.initiator, ranges.target))
     some = ranges[(first & (ranges.target == tag)) | (second & (ranges.initiator == tag))]
@@ -271,24 +277,25 @@ def _given_delays(known: Calibration | None, ranges: Ranges, *, curve: bool) -> 
     """
     if known is None:
         return {}
-    if known.undetermined_splits:
-        text = f"{split_text(known.undetermined_splits)}; fit its recordings together with these"
-        raise BadInputError(text, parameter="delays_from")
-    if known.patterns or known.temperatures:
-        raise BadInputError(
+    found = {tag: known.delays_ns[tag] for tag in ranges.tags() if tag in known.delays_ns}
+    there, here = (", ".join(map(str, sorted(tags))) for tags in (known.delays_ns, ranges.tags()))
+    rows = (
+        (
+            known.undetermined_splits,
+            f"{split_text(known.undetermined_splits)}; fit its recordings together with these",
+        ),
+        (
+            known.patterns or known.temperatures,
             "its delays refer to average directions or a reference temperature; fit its recordings together with "
             "these, or use a calibration fitted with `pattern` and `temperature` none",
-            parameter="delays_from",
-        )
-    found = {tag: known.delays_ns[tag] for tag in ranges.tags() if tag in known.delays_ns}
-    if not found:
-        there, here = (", ".join(map(str, sorted(tags))) for tags in (known.delays_ns, ranges.tags()))
-        raise BadInputError(f"its tags are {there}, but those of the ranges are {here}", parameter="delays_from")
-    if not curve and len(found) == len(ranges.tags()):
-        raise BadInputError(
+        ),
+        (not found, f"its tags are {there}, but those of the ranges are {here}"),
+        (
+            not curve and len(found) == len(ranges.tags()),
             "it has the delays of all tags, and `delays_only` fits no curve, so there is nothing to fit",
-            parameter="delays_from",
-        )
+        ),
+    )
+    refuse(("delays_from", wrong, text) for wrong, text in rows)
     return found
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from calib.errors import BadInputError
+from calib.settings import refuse
 from uwblink.recording.schema import SHAPES, Arrangement, KnownDistance, is_id
 from uwblink.text_files import TomlReader, is_number
 
@@ -165,20 +166,29 @@ def check_knowledge(knowledge: Knowledge, tags: Mapping[str, set[int]]) -> None:
     """
     known: list[KnownDistance | KnownPosition] = [*knowledge.distances, *knowledge.positions]
     named = {*knowledge.shapes, *knowledge.orders, *(one.arrangement for one in known)}
-    strangers = sorted(named - {"", *tags})
-    bad = sorted({shape for shape in (knowledge.shape, *knowledge.shapes.values()) if shape not in SHAPES})
-    wrong = [
-        *(f"contains an unknown arrangement {name!r:.40}; there are {', '.join(sorted(tags))}" for name in strangers),
-        *(f"found {shape!r:.40}, allowed: line, plane" for shape in bad),
-    ]
+    there, shapes = ", ".join(sorted(tags)), {knowledge.shape, *knowledge.shapes.values()}
+    refuse(
+        [
+            *(
+                ("known", True, f"contains an unknown arrangement {name!r:.40}; there are {there}")
+                for name in sorted(named - {"", *tags})
+            ),
+            *(("known", True, f"found {shape!r:.40}, allowed: line, plane") for shape in sorted(shapes - {*SHAPES})),
+        ]
+    )
     for one in known:
         if isinstance(one, KnownDistance):
             who, good = {one.first, one.second}, 0 < one.distance_m <= MAX_LENGTH_M
         else:
             who, good = {one.tag}, all(abs(x) <= MAX_LENGTH_M for x in one.position_m)
-        if not any(who <= there for name, there in tags.items() if one.arrangement in ("", name)):
-            wrong.append(f"{one}: its tags have no ranges in {one.arrangement or 'any arrangement'}")
-        if not (good and MIN_SIGMA_M <= one.sigma_m <= MAX_LENGTH_M):
-            wrong.append(f"{one}: expected more than 0 and up to {MAX_LENGTH_M:g} m ± {MIN_SIGMA_M:g} m or more")
-    if wrong:
-        raise BadInputError(wrong[0], parameter="known")
+        nowhere = not any(who <= own for name, own in tags.items() if one.arrangement in ("", name))
+        refuse(
+            [
+                ("known", nowhere, f"{one}: its tags have no ranges in {one.arrangement or 'any arrangement'}"),
+                (
+                    "known",
+                    not (good and MIN_SIGMA_M <= one.sigma_m <= MAX_LENGTH_M),
+                    f"{one}: expected more than 0 and up to {MAX_LENGTH_M:g} m ± {MIN_SIGMA_M:g} m or more",
+                ),
+            ]
+        )

@@ -27,6 +27,7 @@ from calib.data.ranges import Ranges
 from calib.data.samples import ANCHOR_DELAYS_NS
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
+from calib.estimator.range_model import strangers
 from calib.findings import BUDGET, Finding, warning
 from calib.settings import SurveySettings, refuse
 from calib.surveys.knowledge import Knowledge, check_knowledge, load_knowledge
@@ -255,9 +256,7 @@ def network_of(gathered: SurveyData, knowledge: Knowledge, fixed_ns: Mapping[int
     tags = [tuple(np.unique(means.ends[means.arrangement == k]).tolist()) for k in range(len(gathered.arrangements))]
     check_knowledge(knowledge, {one.name: set(own) for one, own in zip(gathered.arrangements, tags, strict=True)})
     everyone = tuple(np.unique(means.ends).tolist())
-    missing = sorted(set(fixed_ns) - set(everyone))
-    if missing:
-        raise BadInputError(f"tag {missing[0]} is not in the recordings", parameter="fixed_ns")
+    refuse(strangers(fixed_ns, everyone))
     used = [k for k, own in enumerate(tags) if own]
     for k in used:
         one, order = gathered.arrangements[k], knowledge.order_of(gathered.arrangements[k])

@@ -29,7 +29,7 @@ from calib.findings import FIT_LEVELS, Finding, exceeds, warning
 from calib.fitting.fitting import fitted_quantities, result_of
 from calib.fitting.result import FitResult
 from calib.information import LOOSEST, InformationColumn, Verdict, judge
-from calib.settings import FitSettings, FlightSettings
+from calib.settings import FitSettings, FlightSettings, refuse
 from calib.spread import TWO_SIDED_95
 from calib.trajectories.motion import MOTION, TapeRows
 from calib.trajectories.scene import Scene, scene_from
@@ -109,9 +109,7 @@ def _settings(
     names = {one.name for one in fields(FlightSettings)}
     flight = replace(flight or FlightSettings(), **{name: changes[name] for name in changes if name in names})
     settings = replace(settings or FitSettings(), **{name: changes[name] for name in changes if name not in names})
-    for name in settings.changed():
-        if name not in COMMON_SETTINGS:
-            raise BadInputError("can only be used with known distances", parameter=name)
+    refuse((name, name not in COMMON_SETTINGS, "can only be used with known distances") for name in settings.changed())
     known = given_curve(flight.curve_from)
     if known is None:
         return flight, settings, None
