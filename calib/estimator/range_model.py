@@ -70,10 +70,9 @@ class SplineValues:
     @classmethod
     def at(cls, lifted: Floats, knots: Floats) -> SplineValues:
         """Return the splines of `knots` at lifted powers, clamped to their span."""
-        inside = np.clip(lifted, knots[0], knots[-1])
-        values = BSpline.design_matrix(inside, knots, DEGREE).data.reshape(-1, DEGREE + 1)
-        first = np.clip(np.searchsorted(knots, inside, side="right") - 1, DEGREE, len(knots) - DEGREE - 2) - DEGREE
-        return cls(knots=knots, values=values, first=first.astype(np.int32))
+        found = BSpline.design_matrix(np.clip(lifted, knots[0], knots[-1]), knots, DEGREE)
+        first: Ints = np.asarray(found.indices[:: DEGREE + 1], dtype=np.int32)
+        return cls(knots=knots, values=found.data.reshape(-1, DEGREE + 1), first=first)
 
     @property
     def columns(self) -> Ints:

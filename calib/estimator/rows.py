@@ -232,8 +232,8 @@ class NormalRows:
 def normal_terms(left: Floats, std: Floats, derivative: Floats, columns: Ints) -> Terms:
     """Return the terms of rows with normal errors from residuals `left` (n,), measured minus predicted.
 
-    `derivative` (K, n) is the derivative of the prediction by the unknowns `columns` (n, K), `std` (n,) the standard
-    deviations.
+    `derivative` (K, n) is the derivative of the prediction by the unknowns `columns` (n, K), or (1, K) where all rows
+    depend on the same ones; `std` (n,) are the standard deviations.
     """
     z = left / std
     return Terms(
@@ -241,6 +241,6 @@ def normal_terms(left: Floats, std: Floats, derivative: Floats, columns: Ints) -
         slopes=derivative * (z / std),
         score=-z / std,
         columns=columns,
-        starts=np.arange(len(left) + 1),
+        starts=np.arange(len(columns) + 1) * (len(left) // max(len(columns), 1)),
         squares=[Squares(entries=derivative / std, residual=-1 / std)],
     )

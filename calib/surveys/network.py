@@ -172,8 +172,7 @@ class Lengths:
     def terms(self, x: Floats) -> Iterator[Terms]:
         """Yield all rows as one block."""
         left, jacobian = self.network.linear(x, self.case.marks)
-        block = normal_terms(left, self.network.std_m(self.case), jacobian.T, np.arange(len(x))[None])
-        yield replace(block, starts=np.array([0, len(left)]))
+        yield normal_terms(left, self.network.std_m(self.case), jacobian.T, np.arange(len(x))[None])
 
 
 @dataclass(frozen=True, kw_only=True)
