@@ -189,7 +189,10 @@ def _result(
         )
     calibration = calibration_of(found, covariance)
     if known is not None:
-        calibration = _with_curve(calibration, known)
+        uncertainty = calibration.uncertainty and replace(
+            calibration.uncertainty, bias_m2=matrix_of(known.curve_covariance_m2)
+        )
+        calibration = replace(calibration, bias_curve=known.bias_curve, uncertainty=uncertainty)
     provenance = _provenance(found, top, flight) | {"distance_std_m": _distance_std_m(top)}
     provenance |= {"undetermined": [free], "undetermined_text": undetermined} if free else {}
     calibration = replace(
@@ -214,13 +217,6 @@ def _result(
         first=[warning(fault, text) for fault, text in limits if text],
         more=(*_of_motion(top), *_of_tapes(top)),
     )
-
-
-def _with_curve(calibration: Calibration, known: Calibration) -> Calibration:
-    """Return a calibration with the curve of another one and the covariance of that curve."""
-    of_curve = matrix_of(known.curve_covariance_m2)
-    uncertainty = calibration.uncertainty and replace(calibration.uncertainty, bias_m2=of_curve)
-    return replace(calibration, bias_curve=known.bias_curve, uncertainty=uncertainty)
 
 
 def _provenance(found: RangeFit, top: Search, flight: FlightSettings) -> dict[str, Any]:
