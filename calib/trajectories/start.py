@@ -108,11 +108,6 @@ def _window_s(scene: Scene) -> float:
     return float(np.clip(2 * round(RANGES_A_BODY * len(scene.moving) / rate / 2), 2.0, 20.0))
 
 
-def _fit_window(window: Scene, guess: Trajectories, stand: Floats) -> MotionFit:
-    """Return the best motion of a window from a guess."""
-    return fit_motion(window, guess.state(window, stand), SCALES_M, WINDOW_JERK_M_S3)
-
-
 def _extend(
     scene: Scene, seed: Trajectories, stand: Floats, done: Callable[[float], None]
 ) -> tuple[Trajectories, Floats]:
@@ -130,7 +125,8 @@ def _extend(
             new = Trajectories(fresh, _carried_on(near, fresh, sign))
             if len(window.time_s) >= 2:
                 window = replace(window, places=Places.concatenate([window.places, near.places()]))
-                fitted = _fit_window(window, near.joined(new), stand)
+                guess = near.joined(new).state(window, stand)
+                fitted = fit_motion(window, guess, SCALES_M, WINDOW_JERK_M_S3)
                 new, stand = Trajectories(fresh, fitted.positions(fresh)), _stand(fitted)
             found, edge = found.joined(new), float(fresh[-1])
             done(float(found.time_s[-1] - found.time_s[0]) / max(end_s - begin_s, 1e-9))
@@ -225,7 +221,7 @@ def _initial_anchors(scene: Scene, seed: Trajectories) -> Floats:
     tags = [[tag for tag, (body, _) in scene.arms.items() if body == name] for name in sought]
     mine = np.array([np.isin(window.ranges.ends, own).any(axis=1) for own in tags], dtype=np.float64)
     starts = rng.normal(here.mean(axis=0), here.std(axis=0) + START_SPREAD_M, (START_COUNT // 3, len(sought), 3))
-    fits = [_fit_window(window, seed, start) for start in starts]
+    fits = [fit_motion(window, seed.state(window, start), SCALES_M, WINDOW_JERK_M_S3) for start in starts]
     cost = [mine @ np.log1p((one.residuals / SCALES_M[-1]) ** 2) for one in fits]
     best = np.argmin(cost, axis=0).tolist()
     return np.array([_stand(fits[start])[number] for number, start in enumerate(best)])
