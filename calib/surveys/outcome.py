@@ -63,7 +63,7 @@ def result_of(
         reduced(found.information(), np.isin(np.arange(len(found.x)), network.layout.indices(["delay"]))), network.tags
     )
     free = verdict.named("delay")
-    if len(free) == len(network.tags) - len(network.fixed_ns):
+    if free and len(free) == len(network.tags) - len(network.fixed_ns):
         raise UnanswerableError(
             f"the arrangements determine no delay: {'; '.join(verdict.free)} can change without changing any range; "
             f"`calib plan survey` proposes arrangements or distances that determine them",

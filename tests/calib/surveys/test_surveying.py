@@ -515,6 +515,16 @@ def test_a_curve_is_used_if_powers_do_not_vary():
     assert all(sure.delays_std_ns[t] < std for t, std in found.delays_std_ns.items())
 
 
+def test_boards_whose_delays_are_all_known_get_places():
+    known = {1: -0.3, 2: 0.1, 3: -0.1, 4: 0.2}
+    result = calib.survey(calib.sample_arrangements(2), known="line", fixed_ns=known)
+    assert result.calibration.delays_ns == known
+    place = {board.tag: board.position_m[0] for board in result.arrangements[0].boards}
+    # The seed places these neighbours 1.45 m apart; a pair has an error of 1 cm.
+    assert place[2] - place[1] == pytest.approx(1.45, abs=0.04)
+    assert all(0 < board.within_m < 0.1 for board in result.arrangements[0].boards[1:])
+
+
 def test_unusable_curves_are_refused(surveyed):
     ranges, flight = calib.sample_arrangements(2), calib.fit(calib.sample_flight()).calibration
     for refused, settings, message in (
