@@ -116,7 +116,7 @@ class CheckedSettings:
     """Base of settings: checks their values, and lists those that differ from the defaults."""
 
     def __post_init__(self) -> None:
-        """Check choices, numbers and known delays. A number may be None only if its default is None.
+        """Check choices, numbers and known delays. A number may be None only if its type has None.
 
         If the default of a choice is None, other values than its names are accepted, such as a registered loss.
         """
@@ -125,7 +125,7 @@ class CheckedSettings:
             if one.metadata.get("names") and isinstance(one.default, str):
                 check_choice(name, value, one.metadata["names"])
             stated = NUMBERS.get(name) if bounds is None else (*bounds, "{:g} to {:g}".format(*bounds))
-            if stated and (value is not None or one.default is not None):
+            if stated and (value is not None or "None" not in str(one.type)):
                 least, most, expected = stated
                 if not (is_number(value) and least <= value <= most):
                     raise BadInputError(f"found {value!r}, expected {expected}", parameter=name)
