@@ -170,9 +170,10 @@ class Information:
             if priors.update(self.x, self.covariance) < SETTLED:
                 break
         self.covariance_ns2 = self.covariance[:, self.delays][self.delays] * variance_factor(scene)
-        self.verdict = verdict_on(
-            self.covariance_ns2, of_ranges + priors.precision(), self.layout, self.delays, self.tags
-        )
+        # Splits of tags that no range determines are zero, as in a fit: known distances would not determine them.
+        held = sum_rows(model.held_rows(self.layout), self.x).information
+        known = of_ranges + held + priors.precision()
+        self.verdict = verdict_on(self.covariance_ns2, known, self.layout, self.delays, self.tags)
 
     def best_tape(self, still_s: float, sigma_m: float) -> tuple[int, int] | None:
         """Return the pair of tags whose taped distance reduces the variance of the delays most; None if none does.

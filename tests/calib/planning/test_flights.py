@@ -86,6 +86,14 @@ def test_undetermined_delays_are_named_and_measurements_ranked():
     assert told[elsewhere] == pytest.approx(1.96 * math.sqrt(left), rel=1e-3)
 
 
+@pytest.mark.parametrize("until_s", [4.0, None])
+def test_two_sides_stay_open_as_in_a_fit(until_s):
+    """Ranges between two robots determine sums of delays, also where all positions are known."""
+    plan = calib.plan_flight(2, seconds=6.0, poses_until_s=until_s)
+    assert plan.undetermined == (1, 2, 3, 4)
+    assert plan.verdict.free == ("delays of 1 and 2 against delays of 3 and 4",)
+
+
 def test_sought_anchors_stay_open_and_given_ones_do_not():
     seen = flight(seconds=8.0, anchors=CORNERS, rate=60)
     sought = calib.plan_flight(seen, poses_until_s=3.0, anchor_places="sought")
