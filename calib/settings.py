@@ -315,6 +315,11 @@ class FitSettings(CheckedSettings):
                 ),
                 ("groups", self.delays_only and self.groups, "has no effect without a curve (`delays_only`)"),
                 (
+                    "constants",
+                    self.constants == "pair" and (self.fixed_ns or self.delays_from is not None),
+                    "constants of pairs contain all delays, so none can be known; remove one of the two settings",
+                ),
+                (
                     "use",
                     self.use == "receptions" and beside != "use",
                     f"receptions cannot be fitted with `{beside}`",

@@ -83,7 +83,7 @@ def calibration_of(found: RangeFit, delays_ns2: Floats) -> Calibration:
     if of_pairs:
         values = zip(model.pairs.ends.tolist(), found.delays.tolist(), std, strict=True)
         offsets = {(a, b): PairOffset(-METRES_A_NS * delay, METRES_A_NS * error) for (a, b), delay, error in values}
-        fixed = dict.fromkeys(model.tags, 0.0) | dict(fixed)
+        fixed = dict.fromkeys(model.tags, 0.0)
     biases = bias_curves(found)
     errors = None
     spread = robust_spread(found.residuals)

@@ -191,6 +191,14 @@ def test_wrong_settings_are_named(parameter, value):
         calib.fit(ranges(300), **{"loss": "mixture", parameter: value})
 
 
+def test_constants_of_pairs_exclude_known_delays():
+    """The constants of pairs would contain the known delays a second time."""
+    known = calib.fit(ranges(300)).calibration
+    for given in ({"fixed_ns": {1: -0.3}}, {"delays_from": known}):
+        with pytest.raises(calib.BadInputError, match=r"^`constants`: "):
+            calib.fit(ranges(300), constants="pair", **given)
+
+
 def test_numpy_numbers_are_numbers():
     plain: dict[str, Any] = {"scale_ns": 0.1, "fixed_ns": {1: -0.36}, "groups": {"a": (1, 2), "b": (3, 7)}}
     numbers: dict[str, Any] = {
