@@ -223,7 +223,7 @@ class FlightPlanSettings(CheckedSettings):
                 (
                     "robots",
                     not all(0 < tag < 65536 for tag in (*tags, *anchors)),
-                    "found an id below 1, expected ids of 1 or more",
+                    f"found {first_few(map(str, (*tags, *anchors)))}, expected ids of 1 to 65535",
                 ),
             ]
         )
