@@ -130,11 +130,14 @@ class CheckedSettings:
                 if not (is_number(value) and least <= value <= most):
                     raise BadInputError(f"found {value!r}, expected {expected}", parameter=name)
             if name == "fixed_ns":
-                for tag, delay in (value or {}).items():
-                    if not (is_tag(tag) and is_number(delay)):
-                        raise BadInputError(
-                            f"found {tag!r}: {delay!r}, expected a tag id and its delay in ns", parameter=name
-                        )
+                refuse(
+                    (
+                        name,
+                        not (is_tag(tag) and is_number(delay)),
+                        f"found {tag!r}: {delay!r}, expected a tag id and its delay in ns",
+                    )
+                    for tag, delay in (value or {}).items()
+                )
                 object.__setattr__(self, name, {int(tag): float(delay) for tag, delay in (value or {}).items()})
 
     def changed(self) -> dict[str, Any]:
