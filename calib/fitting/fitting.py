@@ -141,7 +141,7 @@ def _provenance(found: RangeFit, ranges: Ranges, settings: FitSettings) -> dict[
         "fitted": fitted_quantities(found),
         **({"arrivals": len(arrivals.residual)} if (arrivals := found.searches[0].arrivals) else {}),
         **({"arrivals": len(ranges)} if ranges.differences.any() else {}),
-        "gauge": _gauge(found),
+        "gauge": gauge_of(found),
         **({"drift": drift} if (drift := drift_of(found)) else {}),
     }
 
@@ -426,7 +426,7 @@ def fitted_quantities(found: RangeFit) -> str:
     return "curve only" if model.pinned else "delays and curve"
 
 
-def _gauge(found: RangeFit) -> str:
+def gauge_of(found: RangeFit) -> str:
     """Return a sentence on the choice of the common constant of delays and curve."""
     carrier = "constants of pairs" if found.model.settings.constants == "pair" else "delays"
     if found.model.curve is None:

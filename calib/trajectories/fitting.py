@@ -26,7 +26,7 @@ from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
 from calib.estimator.unknowns import Layout
 from calib.findings import FIT_LEVELS, Finding, exceeds, warning
-from calib.fitting.fitting import fitted_quantities, result_of
+from calib.fitting.fitting import fitted_quantities, gauge_of, result_of
 from calib.fitting.result import FitResult
 from calib.information import LOOSEST, InformationColumn, Verdict, judge
 from calib.settings import FitSettings, FlightSettings, refuse
@@ -221,7 +221,7 @@ def _result(
 
 def _provenance(found: RangeFit, top: Search, flight: FlightSettings) -> dict[str, Any]:
     """Return the provenance that only fits of trajectories have."""
-    scene, places_s, reference_dbm = top.motion.scene, top.motion.scene.places.time_s, found.model.reference_dbm
+    scene, places_s = top.motion.scene, top.motion.scene.places.time_s
     return {
         "recordings": [scene.source],
         "recipe": "trajectories",
@@ -237,9 +237,8 @@ def _provenance(found: RangeFit, top: Search, flight: FlightSettings) -> dict[st
             "distances": len(scene.tapes.stated),
             "heights": sorted({scene.moving[body] for body in scene.heights.body.tolist()}),
         },
-        "reference_power_dbm": reference_dbm,
-        "gauge": f"the bias curve{' was given, and' if flight.curve_from else ''} is zero at {reference_dbm:g} dBm; "
-        f"the delays contain the common constant",
+        "reference_power_dbm": found.model.reference_dbm,
+        "gauge": "that of the calibration whose curve was used" if flight.curve_from else gauge_of(found),
     }
 
 
