@@ -113,6 +113,11 @@ class SurveyPlanSettings(CheckedSettings):
                     f"found {first_few(map(str, tags))}, expected 2 to 30 boards, each once",
                 ),
                 ("anchors", strangers, f"{min(strangers, default=0)} is none of the boards"),
+                (
+                    "anchors",
+                    len(set(self.anchors)) < len(self.anchors),
+                    f"found {self.anchors}, expected each board once",
+                ),
                 ("anchors", self.anchors and self.on == "line", on_line),
                 (
                     "size_m",

@@ -133,6 +133,7 @@ def test_the_command_prints_steps_and_json():
         (4, {"reflected": 0.4}, "reflected"),
         (4, {"on": "plane", "anchors": [9]}, "anchors"),
         (4, {"on": "line", "anchors": [1]}, "anchors"),
+        (4, {"on": "plane", "anchors": [1, 2, 1]}, "anchors"),
         (4, {"rate_hz": 0.0}, "rate_hz"),
         (30, {"on": "plane", "size_m": (0.5, 0.5)}, "there is no room"),
     ],
