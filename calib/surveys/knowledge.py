@@ -184,6 +184,7 @@ def check_knowledge(knowledge: Knowledge, tags: Mapping[str, set[int]]) -> None:
         nowhere = not any(who <= own for name, own in tags.items() if one.arrangement in ("", name))
         refuse(
             [
+                ("known", isinstance(one, KnownDistance) and len(who) < 2, f"{one}: expected two different tags"),
                 ("known", nowhere, f"{one}: its tags have no ranges in {one.arrangement or 'any arrangement'}"),
                 (
                     "known",

@@ -384,6 +384,7 @@ def test_errors_in_files_of_known_facts_are_one_line(tmp_path, text, message):
         ({"known": calib.Knowledge(shape="ring")}, "ring"),
         ({"known": calib.Knowledge(shapes={"9": "line"})}, "contains an unknown arrangement '9'"),
         ({"known": calib.Knowledge(distances=(KnownDistance(1, 9, 1.0, 0.1),))}, "have no ranges"),
+        ({"known": calib.Knowledge(distances=(KnownDistance(1, 1, 1.0, 0.1),))}, "two different tags"),
         ({"known": calib.Knowledge(distances=(KnownDistance(1, 2, math.nan, 0.1),))}, "more than 0"),
         ({"known": calib.Knowledge(distances=(KnownDistance(1, 2, 1.0, 1e300),))}, "or more"),
         ({"known": calib.Knowledge(distances=(KnownDistance(1, 2, 1.0, 1e-300),))}, "or more"),
