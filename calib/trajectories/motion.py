@@ -123,13 +123,20 @@ class Motion:
             # the constant offset of a height sensor, chosen on the MILUV flight (docs/theory.md)
             "level": (1, [Prior.of_deviation(0.15)]),
         }
-        found = []
-        for kind, (points, priors) in blocks.items():
-            names = tuple(np.repeat(self.bodies[kind], MOTION[kind]).tolist()) * points
-            if names:
-                values = np.ravel(start.get(kind, np.zeros(len(names))))
-                found.append(Unknown(kind=kind, names=names, start=values, priors=tuple(priors)))
-        return tuple(found)
+        names = {
+            kind: tuple(np.repeat(self.bodies[kind], MOTION[kind]).tolist()) * points
+            for kind, (points, _) in blocks.items()
+        }
+        return tuple(
+            Unknown(
+                kind=kind,
+                names=own,
+                start=np.ravel(start.get(kind, np.zeros(len(own)))),
+                priors=tuple(blocks[kind][1]),
+            )
+            for kind, own in names.items()
+            if own
+        )
 
     def numbers(self, layout: Layout, kind: str) -> Ints:
         """Return the indices (points, bodies, axes) of a kind into all unknowns."""
