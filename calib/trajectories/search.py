@@ -141,14 +141,14 @@ class Search:
         self.priors = Priors(self.layout)
         self.priors.recall(self.weights)
 
-    def optimize(self, errors: Errors, *, evidence_steps: int = 0, tolerance: float = 0.1, steps: int = 60) -> Optimum:
+    def optimize(self, errors: Errors, *, evidence_steps: int = 0, tolerance: float = 0.1) -> Optimum:
         """Maximise the likelihood, and update values and leverages."""
         self.rows = replace(self.rows, errors=errors)
         found = maximize(
             [self.rows, *self.known.values(), *self.gauge],
             self.priors,
             self.x,
-            steps=steps,
+            steps=60,
             evidence_steps=evidence_steps,
             tolerance=tolerance,
             asked=self.layout.indices(["delay", *self.model.curve_kinds()]),
