@@ -77,7 +77,7 @@ class Terms:
         if self.movements is not None:
             columns = np.concatenate([columns, self.movements.columns], axis=1)
             entries = np.concatenate([entries, residual[:, None] * self.movements.derivative], axis=1)
-        return _matrix(columns, entries, size)
+        return sparse_rows(columns, entries, size)
 
     def gradient(self, size: int) -> Floats:
         """Return the sum of the slopes by all unknowns (size,)."""
@@ -90,7 +90,7 @@ class Terms:
         return found
 
 
-def _matrix(columns: Ints, entries: Floats, size: int) -> sparse.csr_matrix:
+def sparse_rows(columns: Ints, entries: Floats, size: int) -> sparse.csr_matrix:
     """Return entries (n, k) at columns (n, k) as a sparse matrix (n, size)."""
     bounds = np.arange(len(columns) + 1) * columns.shape[1]
     return sparse.csr_matrix((entries.ravel(), columns.ravel(), bounds), shape=(len(columns), size))
@@ -172,13 +172,13 @@ def _placed(products: Floats, place: Ints, size: int) -> sparse.csc_matrix:
 
 def _of_movements(terms: Terms, movements: Movements, size: int) -> sparse.csc_matrix:
     """Return the information between the unknowns that move residuals, and between these and the others."""
-    own = _matrix(movements.columns, movements.derivative, size)
+    own = sparse_rows(movements.columns, movements.derivative, size)
     alone, across = np.zeros(len(terms.score)), np.zeros_like(terms.slopes)
     for part in terms.squares:
         pull = part.weight * part.residual
         alone += pull * part.residual
         across += pull * part.entries
-    others = _matrix(np.repeat(terms.columns, np.diff(terms.starts), axis=0), across.T, size)
+    others = sparse_rows(np.repeat(terms.columns, np.diff(terms.starts), axis=0), across.T, size)
     half = sparse.csc_matrix(own.T @ (sparse.diags(0.5 * alone) @ own + others))
     return sparse.csc_matrix(half + half.T)
 
@@ -191,7 +191,7 @@ def _bends(movements: Movements, size: int) -> sparse.csc_matrix:
     larger, are included.
     """
     shares = np.broadcast_to((np.sqrt(movements.bend)[:, None] * movements.shares)[:, None, :], movements.axes.shape)
-    moved = _matrix(movements.axes.reshape(-1, shares.shape[-1]), shares.reshape(-1, shares.shape[-1]), size)
+    moved = sparse_rows(movements.axes.reshape(-1, shares.shape[-1]), shares.reshape(-1, shares.shape[-1]), size)
     return sparse.csc_matrix(moved.T @ moved)
 
 

@@ -15,7 +15,7 @@ from scipy import sparse, special
 
 from calib.estimator.optimize import Optimum
 from calib.estimator.range_rows import RangeRows
-from calib.estimator.rows import Terms
+from calib.estimator.rows import Terms, sparse_rows
 from calib.estimator.time_blocks import Persistence, TimeBlocks, persistence
 from calib.findings import exceeds
 from uwblink.arrays import Floats, Ints
@@ -46,8 +46,7 @@ class Derivative:
         """Return some rows."""
         columns = self.columns[rows]
         values = np.broadcast_to(self.values if len(self.values) == 1 else self.values[rows], columns.shape)
-        bounds = np.arange(len(columns) + 1) * columns.shape[1]
-        return sparse.csr_matrix((values.flatten(), columns.ravel(), bounds), shape=(len(columns), self.size))
+        return sparse_rows(columns, values, self.size)
 
 
 @dataclass(frozen=True, kw_only=True)
