@@ -181,10 +181,8 @@ class RangeModel:
     @property
     def reference_dbm(self) -> float | None:
         """Return the power in dBm at which curves are zero, None for no such condition."""
-        settings = self.settings
-        if settings.reference_power_dbm is None and not settings.sequential:
-            return settings.alpha_dbm
-        return settings.reference_power_dbm
+        settings, stated_dbm = self.settings, self.settings.reference_power_dbm
+        return settings.alpha_dbm if stated_dbm is None and not settings.sequential else stated_dbm
 
     @property
     def pinned(self) -> bool:
