@@ -29,10 +29,11 @@ NUMBERS: Final = {
     "hold_out": (0.0, 0.9, "a share, 0 to 0.9"),
     "poses_until_s": (0.0, math.inf, "a number of 0 or more"),
     "heading_std_deg": (0.0, math.inf, "a number of 0 or more"),
-    "pair_error_m": (POSITIVE, math.inf, "a positive number of metres"),
+    "pair_error_m": (1e-9, 100.0, "metres, 1e-9 to 100"),
     **dict.fromkeys(("velocity_std_mps", "velocity_rate_hz", "initial_std_m", "gate", "reopen_s"), ABOVE_ZERO),
     **dict.fromkeys(("start_std_m", "start_std_deg", "start_std_m_s", "rate_hz", "speed_m_s"), ABOVE_ZERO),
     "seeds": (1, 1000, "1 to 1000"),
+    "seed": (0, math.inf, "a whole number of 0 or more"),
 }
 """Smallest and largest value of settings without `bounds` in their metadata, and the expected value in words."""
 
@@ -116,7 +117,8 @@ class CheckedSettings:
     """Base of settings: checks their values, and lists those that differ from the defaults."""
 
     def __post_init__(self) -> None:
-        """Check choices, numbers and known delays. A number may be None only if its type has None.
+        """Check choices, numbers and known delays. A number is whole if its type is int, and may be None only if its
+        type has None.
 
         If the default of a choice is None, other values than its names are accepted, such as a registered loss.
         """
@@ -127,7 +129,8 @@ class CheckedSettings:
             stated = NUMBERS.get(name) if bounds is None else (*bounds, "{:g} to {:g}".format(*bounds))
             if stated and (value is not None or "None" not in str(one.type)):
                 least, most, expected = stated
-                if not (is_number(value) and least <= value <= most):
+                fits = isinstance(value, Integral) or "int" not in str(one.type)
+                if not (fits and is_number(value) and least <= value <= most):
                     raise BadInputError(f"found {value!r}, expected {expected}", parameter=name)
             if name == "fixed_ns":
                 refuse(

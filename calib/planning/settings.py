@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -11,6 +11,7 @@ from calib.errors import BadInputError
 from calib.settings import CheckedSettings, check_choice, refuse
 from uwblink.display import first_few
 from uwblink.settings import setting
+from uwblink.text_files import is_number
 
 ROOMS_M: Final = {"line": (5.0,), "plane": (3.0, 2.0), "space": (6.0, 5.0, 2.5)}
 """Default lengths of the places for boards: a string across a room, a large table, a room."""
@@ -35,8 +36,9 @@ def read_whole(text: str, parameter: str | None = None) -> list[int]:
     return [int(value) for value in found]
 
 
-def _are_lengths(size_m: Sequence[float], dimensions: int) -> bool:
-    return len(size_m) == dimensions and all(math.isfinite(v) and 0 < v <= 1000 for v in size_m)
+def _are_lengths(size_m: object, dimensions: int) -> bool:
+    sides = list(size_m) if isinstance(size_m, Iterable) else []
+    return len(sides) == dimensions and all(is_number(side) and 0 < side <= 1000 for side in sides)
 
 
 OF_BOTH: Final[dict[str, Any]] = {

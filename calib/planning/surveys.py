@@ -9,7 +9,7 @@ deviation of 5 cm; powers fall with distance as in free space.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from string import ascii_uppercase
@@ -22,6 +22,7 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.information import reduced
 from calib.planning.result import NextBest, Plan, PlannedArrangement, Precision, mean_std_ns
 from calib.planning.settings import ROOMS_M, SurveyPlanSettings
+from calib.settings import is_tag
 from calib.spread import TWO_SIDED_95
 from calib.surveys.knowledge import KnownPosition
 from calib.surveys.network import Boards, Case, CurvePrior, Linear, Network
@@ -165,9 +166,9 @@ def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None
     >>> calib.plan(3, on="line", arrangements=1).undetermined
     (1, 3)
     """
-    tags = tuple(range(1, boards + 1)) if isinstance(boards, int) else tuple(int(tag) for tag in boards)
-    if len(tags) < 2:
-        raise BadInputError(f"found {boards!r:.60}, expected 2 to 30 boards, each once", parameter="boards")
+    tags = tuple(range(1, boards + 1) if isinstance(boards, int) else boards if isinstance(boards, Iterable) else ())
+    if len(tags) < 2 or not all(map(is_tag, tags)):
+        raise BadInputError(f"found {boards!r:.60}, expected 2 to 30 ids below 65536, or a count", parameter="boards")
     inputs = replace(settings or SurveyPlanSettings(), tags=tags, **changes)
     # The best of sixty is in the best 5 % with a probability of 95 %.
     candidates = random_arrangements(inputs, 60)

@@ -180,7 +180,8 @@ def check_knowledge(knowledge: Knowledge, tags: Mapping[str, set[int]]) -> None:
         if isinstance(one, KnownDistance):
             who, good = {one.first, one.second}, 0 < one.distance_m <= MAX_LENGTH_M
         else:
-            who, good = {one.tag}, all(abs(x) <= MAX_LENGTH_M for x in one.position_m)
+            who = {one.tag}
+            good = len(one.position_m) == 3 and all(abs(x) <= MAX_LENGTH_M for x in one.position_m)
         nowhere = not any(who <= own for name, own in tags.items() if one.arrangement in ("", name))
         refuse(
             [

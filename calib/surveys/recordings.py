@@ -29,7 +29,7 @@ from calib.estimator.to_calibration import error_model
 from calib.estimator.unknowns import Prior, Priors, Unknown
 from calib.findings import Finding, warning
 from calib.pairs import Pairs
-from calib.settings import FitSettings
+from calib.settings import FitSettings, refuse
 from calib.spread import STD_OF_MEDIAN, medians, robust_spread
 from calib.surveys.knowledge import Knowledge
 from uwblink.arrays import ColumnTable, Floats, Ints
@@ -142,6 +142,10 @@ def _arrangements(
     if knowledge.spans_s:
         start = int(ranges.time_ns.min())
         spans = knowledge.spans_s.items()
+        refuse(
+            ("known", not np.isfinite(span).all(), f"{name}: found {span}, expected its start and end in seconds")
+            for name, span in spans
+        )
         return [Arrangement(name, start + round(a * 1e9), start + round(b * 1e9)) for name, (a, b) in spans]
     if marked:
         return marked

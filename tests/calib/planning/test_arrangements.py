@@ -123,10 +123,11 @@ def test_the_command_prints_steps_and_json():
     ("boards", "settings", "message"),
     [
         (1, {}, "boards"),
-        ([1, 1], {}, "boards"),
+        *((wrong, {}, "boards") for wrong in ([1, 1], [-1, 2], [1, 70000], [1.5, 2], "abc", 3.5)),
+        *((4, {"seed": wrong}, "seed") for wrong in (-1, 1.5)),
         (4, {"on": "ring"}, "on"),
         (4, {"arrangements": 0}, "arrangements"),
-        (4, {"size_m": (1.0, 2.0)}, "size_m"),
+        *((4, {"size_m": wrong}, "size_m") for wrong in ((1.0, 2.0), 3.0)),
         (4, {"taped": -1}, "taped"),
         (4, {"tape_sigma_m": 0.0}, "tape_sigma_m"),
         (4, {"pair_error_m": math.nan}, "pair_error_m"),
