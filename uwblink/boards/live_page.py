@@ -211,14 +211,16 @@ def _clock(time_ns: int) -> str:
 
 
 def spread_cm(values: Sequence[float]) -> str:
-    """Return the standard deviation of values about their neighbours as text, "" for fewer than ten values.
+    """Return the standard deviation of values about their neighbours as text, "" for fewer than ten finite values.
 
     Second differences of white noise have six times its variance, and those of a smooth motion are small. Two thirds
     of normal errors lie within a standard deviation.
     """
-    if len(values) < 10:
+    second = np.diff(values, 2)
+    second = second[np.isfinite(second)]
+    if len(second) < 8:
         return ""
-    low, high = np.nanquantile(np.diff(values, 2), (0.16, 0.84))
+    low, high = np.quantile(second, (0.16, 0.84))
     return f"{100 * (high - low) / 2 / math.sqrt(6):.1f}"
 
 

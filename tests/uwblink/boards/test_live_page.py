@@ -103,6 +103,7 @@ def test_the_page_shows_success_of_ten_seconds_noise_and_gaps(tmp_path):
     # 198 second differences determine a spread to a tenth.
     assert float(cells[5]) == pytest.approx(5.0, rel=0.25)
     assert cells[-1].count("<polyline") == 2
+    assert live_page.spread_cm([np.nan] * 12) == "", "a correction may have no result"
 
 
 def test_an_unplugged_board_stays_named_until_it_is_back(tmp_path):
