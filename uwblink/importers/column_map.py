@@ -227,7 +227,10 @@ MAP_KEYS: Final = (
         "constants.NAME", "number; text for an id", "none", "A value for all rows, for a column that the table lacks."
     ),
     FileKey(
-        'ids."WORD"', "whole number", "the next free ones, in alphabetical order", "The number of an id, such as a word."
+        'ids."WORD"',
+        "whole number",
+        "the next free ones, in alphabetical order",
+        "The number of an id, such as a word.",
     ),
     FileKey("antenna_delays.unit", '"ticks" or "ns"', "ticks", "Unit of the antenna delays below."),
     FileKey(

@@ -65,7 +65,7 @@ def check_text(path: Path, raw: bytes) -> None:
         raise ImportTableError(f"{path}: not a text file (it contains zero bytes); expected a table in UTF-8")
 
 
-class Dialect(NamedTuple):
+class TableForm(NamedTuple):
     """The form of a CSV file: names of columns, delimiter, decimal mark, encoding, and lines before the first values.
 
     Text that is not UTF-8 is taken as Latin-1, which older programs write.
@@ -91,7 +91,7 @@ def _decoded(raw: bytes) -> tuple[str, str]:
         return raw.decode("latin-1"), "latin-1"
 
 
-def detect(path: Path, column_map: ColumnMap) -> Dialect:
+def detect(path: Path, column_map: ColumnMap) -> TableForm:
     """Return the dialect of a CSV file by its first 64 KiB, for parts that the map does not state.
 
     Without a header the names are "1", "2" and so on. Lines before the header that are empty or begin with "#" are
@@ -119,7 +119,7 @@ def detect(path: Path, column_map: ColumnMap) -> Dialect:
             for digits, mark in (("+", ","), ("*", r"\."))
         )
         decimal = "," if commas > points else "."
-    return Dialect(names, mark, decimal == "," and mark != ",", skip, encoding)
+    return TableForm(names, mark, decimal == "," and mark != ",", skip, encoding)
 
 
 def lacks_header(names: Sequence[str]) -> bool:
