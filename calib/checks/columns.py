@@ -82,7 +82,7 @@ def single_as_double(view: RecordingView) -> Iterator[Candidate]:
     """Find double-sided exchanges without a third message."""
     e = view.exchanges
     double = ~np.isin(e.protocol, single_sided())
-    empty = np.count_nonzero(double & (e.tx3 == 0) & (e.rx3 == 0)) / max(np.count_nonzero(double), 1)
+    empty = float(np.mean((e.tx3 | e.rx3)[double] == 0)) if double.any() else 0.0
     if empty > 0.5:
         yield Candidate(
             "single-sided data taken for double-sided",

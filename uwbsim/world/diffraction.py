@@ -286,8 +286,8 @@ def planes(mirrors: Mirrors, a: Floats, b: Floats) -> tuple[Floats, Bools]:
     plane[:, :walls] = mirrors.plane_m
     below = np.maximum(a, b)[:, None] <= mirrors.low_m
     above = np.minimum(a, b)[:, None] >= mirrors.high_m
-    plane[:, walls:] = np.where(below, mirrors.low_m, mirrors.high_m).reshape(count, -1)
-    there[:, walls:] = (below | above).reshape(count, -1)
+    plane[:, walls:] = np.where(below, mirrors.low_m, mirrors.high_m).reshape(count, mirrors.low_m.size)
+    there[:, walls:] = (below | above).reshape(count, mirrors.low_m.size)
     return plane, there
 
 
