@@ -17,7 +17,7 @@ import numpy as np
 from uwblink.errors import FrameError
 from uwblink.ticks import REPORT_BITS, TICK_S, elapsed
 from uwblink.twr import STAMPS, Exchanges
-from uwblink.wire.fields import LONGEST_TEXT, ZEROS, Kind, Malformed, NeedMore
+from uwblink.wire.fields import LONGEST_TEXT, Kind, Malformed, NeedMore
 from uwblink.wire.messages import (
     COMMANDS,
     TEXTS,
@@ -43,6 +43,8 @@ def encode(message: Message) -> bytes:
             parts.append(kind.write(getattr(message, name)))
         except FrameError as error:
             raise FrameError(f"{message.KEY.decode()} {name}: {error}") from error
+    if isinstance(message, OverheardNothing):
+        parts += [b"0"] * message.ZEROS
     return b"|".join(parts) + _terminator(message.KEY)
 
 
@@ -170,8 +172,10 @@ def _from_parts(kind: type[Message], parts: list[bytes]) -> Message:
     """Build a message from its fields; `parts[0]` is the text between key and first bar."""
     if parts[0]:
         raise Malformed
-    if kind is Overheard and len(parts) == 3 + ZEROS.parts:
-        kind = OverheardNothing
+    if kind is Overheard and len(parts) == 3 + OverheardNothing.ZEROS:
+        if parts[3:] != [b"0"] * OverheardNothing.ZEROS:
+            raise Malformed
+        kind, parts = OverheardNothing, parts[:3]
     values, at = list[Any](), 1
     for field in kind.FIELDS.values():
         values.append(field.read(b"|".join(parts[at : at + field.parts])))

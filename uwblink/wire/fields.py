@@ -165,15 +165,6 @@ MAGNITUDES: Final = _text(
     f"{TAPS} whole numbers from 0 to 99999",
     parts=TAPS,
 )
-ZEROS: Final = _text(
-    "24 zeros",
-    rb"0(?:\|0){23}",
-    lambda _: None,
-    lambda _: b"|".join([b"0"] * 24),
-    lambda value: value is None,
-    "None",
-    parts=24,
-)
 RAW_FLOAT: Final = Kind(
     "four-byte float", lambda data: struct.unpack("<f", data)[0], _write_raw_float, lambda _data, _at: 4
 )

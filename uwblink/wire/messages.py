@@ -35,7 +35,6 @@ from uwblink.wire.fields import (
     STAMP,
     TAPS,
     TEXT,
-    ZEROS,
     Kind,
 )
 
@@ -260,9 +259,9 @@ class Overheard(Message):
 class OverheardNothing(Message):
     """S01 with 26 fields, all zero after the ids: the listener missed the response."""
 
+    ZEROS: ClassVar = 24
     initiator: int = wire(ID)
     target: int = wire(ID)
-    nothing: None = wire(ZEROS, default=None)
 
 
 @message(b"S06")
