@@ -390,7 +390,7 @@ def test_errors_in_files_of_known_facts_are_one_line(tmp_path, text, message):
         ({"known": calib.Knowledge(distances=(KnownDistance(1, 2, 1.0, 1e-300),))}, "or more"),
         ({"known": calib.Knowledge(distances=(KnownDistance(1, 2, 1e200, 0.1),))}, r"up to 1e\+06 m"),
         ({"known": calib.Knowledge(positions=(calib.KnownPosition(9, (0, 0, 0)),))}, "have no ranges"),
-        ({"known": calib.Knowledge(positions=(calib.KnownPosition(1, (0, 0)),))}, "or more"),
+        ({"known": calib.Knowledge(positions=(calib.KnownPosition(1, (0, 0)),))}, "or more"),  # type: ignore[arg-type]
         ({"known": calib.Knowledge(spans_s={"0": (0.0, math.inf)})}, "start and end"),
         *(({"pair_error_m": wrong}, "pair_error_m") for wrong in (-1.0, 1e-300, 1e300)),
         ({"fixed_ns": {9: 0.1}}, "fixed_ns"),

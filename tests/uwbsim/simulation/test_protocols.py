@@ -389,6 +389,13 @@ def test_far_listeners_receive_nothing_and_listening_has_no_effect():
     np.testing.assert_array_equal(both.overheard["rx1"][both.overheard["listener"] == 3], near.overheard["rx1"])
 
 
+def test_boxes_have_no_effect_on_exchanges_that_nobody_receives():
+    settings = {"run.duration_s": 0.5, "ranging.get_cir": True, "radio.sensitivity_dbm": 0.0}
+    result = simulate(load("office/office", settings))
+    assert (len(result.exchanges), len(result.cirs)) == (0, 0)
+    assert result.faults
+
+
 def test_impulse_responses_agree_with_stamp_and_room():
     result = flight(room={"min_m": (-5, -5, -1.5), "max_m": (65, 5, 2.0), "reflection_loss_db": 3.0}, get_cir=True)
     assert len(result.cirs) == len(result.exchanges) == 100
