@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
-from scipy.stats import exponnorm, norm
+from scipy import integrate, stats
 
 from calib.errors import BadInputError
 from calib.information import InformationColumn, judge
@@ -101,10 +100,10 @@ def test_one_and_two_kinds_of_detour_are_exponentials(share):
     # From far below the least detour to where the noise is negligible.
     e, long = np.linspace(-0.6, 12, 500), LongDetours(share=share, factor=4.0)
     found = densities(e, np.full(500, SIGMA), LEAST, DETOUR, long)
-    np.testing.assert_allclose(found.direct, norm.pdf(e, scale=SIGMA), rtol=1e-12, atol=1e-300)
+    np.testing.assert_allclose(found.direct, stats.norm.pdf(e, scale=SIGMA), rtol=1e-12, atol=1e-300)
     first = DETOUR / (1 - share + share * 4)
     parts = [(1 - share, first), (share, 4 * first)]
-    expected = sum(share * exponnorm.pdf(e, mean / SIGMA, loc=LEAST, scale=SIGMA) for share, mean in parts)
+    expected = sum(share * stats.exponnorm.pdf(e, mean / SIGMA, loc=LEAST, scale=SIGMA) for share, mean in parts)
     np.testing.assert_allclose(found.reflected, expected, rtol=1e-9, atol=1e-300)
     assert sum(share * mean for share, mean in parts) == pytest.approx(DETOUR)
     assert long.square * DETOUR**2 == pytest.approx(sum(share * mean**2 for share, mean in parts))
@@ -137,7 +136,7 @@ def slopes(error, **changed):
 
 def test_the_density_is_one():
     points = [0.0, 0.05, 0.2, 1.0]
-    mass, _ = quad(lambda e: float(np.exp(slopes(e).log_density[0])), -1.0, 9.0, points=points, limit=400)
+    mass, _ = integrate.quad(lambda e: float(np.exp(slopes(e).log_density[0])), -1.0, 9.0, points=points, limit=400)
     # Outliers are spread over ten metres, from any origin.
     assert mass == pytest.approx(1.0, abs=2e-4)
 

@@ -12,16 +12,13 @@ import numpy as np
 import pytest
 
 import calib
-from calib.calibration.formats import programmed, read_miluv, registers
-from calib.calibration.model import TagGroup
-from calib.calibration.patterns import Pattern, TemperatureSlope
+from calib.calibration import formats, model, patterns
 from calib.calibration.power_curves import flat_curve
 from tests.calib.synthetic import DELAYS_NS, ranges
 from tests.shared_data import miluv, shared
-from uwblink.importers import read_source
+from uwblink import importers, ticks
 from uwblink.recording.antenna_delays import AntennaDelay
 from uwblink.recording.contents import Contents
-from uwblink.ticks import TICK_S
 
 
 @pytest.fixture(scope="module")
@@ -40,14 +37,14 @@ def test_registers_add_to_programmed_delays(tmp_path, fitted):
     single = {"configured_antenna_delay_ticks_by_tag": {"1": {"tx": 16440, "rx": 16430}}}
     meta = {"configured_antenna_delay_ticks": {"tx": 0, "rx": 0}, **single}
     Contents(exchanges=calib.sample_flight(10).exchanges, meta=meta).save(tmp_path / "r.uwb")
-    found = registers(known, programmed(tmp_path / "r.uwb"))
-    d = 0.25e-9 / TICK_S
+    found = formats.registers(known, formats.programmed(tmp_path / "r.uwb"))
+    d = 0.25e-9 / ticks.TICK_S
     assert found[1] == (round(16440 - 0.44 * d), round(16430 - 0.56 * d), 16440)
     # A device with registers of zero: both registers together are its whole delay, not 32872 ticks more.
-    assert sum(found[2][:2]) == pytest.approx(513.5e-9 / TICK_S, abs=1)
+    assert sum(found[2][:2]) == pytest.approx(513.5e-9 / ticks.TICK_S, abs=1)
     with pytest.raises(calib.BadInputError, match="tag 1: its registers would be -7/-9"):
-        registers(known, {None: AntennaDelay(0, 0, 0)})
-    text = calib.export(known, "registers", base=programmed(tmp_path / "r.uwb"))
+        formats.registers(known, {None: AntennaDelay(0, 0, 0)})
+    text = calib.export(known, "registers", base=formats.programmed(tmp_path / "r.uwb"))
     assert tomllib.loads(text)["antenna_delays"]["tags"]["1"] == found[1]._asdict()
 
 
@@ -92,7 +89,7 @@ int main(void)
 
 def pattern(tags, seed):
     factors, centre, *spread = np.random.default_rng(seed).normal(0, 0.05, (10, 8))
-    return Pattern(
+    return patterns.Pattern(
         tags, tuple(factors), tuple(centre), tuple(map(tuple, np.square(spread) @ np.square(spread).T)), 0.05
     )
 
@@ -167,7 +164,7 @@ int main(void)
 
 
 def test_the_c_header_states_the_effect_of_temperatures(tmp_path, fitted):
-    slopes = (TemperatureSlope((1, 2, 3, 7), 0.005, 0.0002, 27.5, (20.0, 35.0)),)
+    slopes = (patterns.TemperatureSlope((1, 2, 3, 7), 0.005, 0.0002, 27.5, (20.0, 35.0)),)
     known, expected = replace(fitted, temperatures=slopes), list[float]()
     plain = fitted.correct(3.0, -85.0, -86.0, 1, 3)
     for celsius in ((30.0, 24.5), (30.0, np.nan), (np.nan, np.nan)):
@@ -179,7 +176,7 @@ def test_the_c_header_states_the_effect_of_temperatures(tmp_path, fitted):
 
 def test_miluv_is_read_and_given_back_unchanged():
     path = shared("miluv_published_calibration.json")
-    found = read_miluv(path)
+    found = formats.read_miluv(path)
     assert json.loads(calib.export(found, "miluv")) == json.loads(path.read_text())
     assert found.delays_ns[5] == pytest.approx(-0.7376667)
     assert found.bias_curve(np.array([0.5]))[0] == pytest.approx(0.081, abs=0.002)
@@ -193,7 +190,7 @@ def test_the_published_calibration_gives_the_published_ranges(tmp_path):
     wrong tag.
     """
     folder, began = miluv(tmp_path), 1_706_822_508_042_560_815
-    e = read_source(folder, importer="miluv").exchanges
+    e = importers.read_source(folder, importer="miluv").exchanges
     rows = [row for path in folder.glob("*/uwb_range.csv") for row in csv.DictReader(path.read_text().splitlines())]
     published = {
         (row["from_id"], row["to_id"], round(float(row["timestamp"]) * 1e9)): float(row["range"]) for row in rows
@@ -201,7 +198,9 @@ def test_the_published_calibration_gives_the_published_ranges(tmp_path):
     ends = zip(
         e.initiator.astype(str).tolist(), e.target.astype(str).tolist(), (e.time_ns - began).tolist(), strict=True
     )
-    found = read_miluv(shared("miluv_published_calibration.json")).apply(calib.Ranges.from_exchanges(e)).corrected_m
+    found = (
+        formats.read_miluv(shared("miluv_published_calibration.json")).apply(calib.Ranges.from_exchanges(e)).corrected_m
+    )
     off = found - [published[one] for one in ends]
     assert len(off) == 317
     assert np.abs(off).max() < 0.015
@@ -233,14 +232,14 @@ MILUV = '{"delays_ns": {"1": 0.1}, "bias_spline_m": %s, "std_spline_m": %s}'
 def test_miluv_calibrations_with_infinite_numbers_are_refused(tmp_path, old, new):
     good = MILUV % (SPLINE, SPLINE)
     (tmp_path / "m.json").write_text(good)
-    assert read_miluv(tmp_path / "m.json").delays_ns == {1: 0.1}
+    assert formats.read_miluv(tmp_path / "m.json").delays_ns == {1: 0.1}
     (tmp_path / "m.json").write_text(good.replace(old, new))
     with pytest.raises(calib.BadInputError, match=r"m\.json: (not a MILUV calibration|delays_ns)"):
-        read_miluv(tmp_path / "m.json")
+        formats.read_miluv(tmp_path / "m.json")
 
 
 def test_formats_with_one_curve_refuse_groups(fitted):
-    groups = {"a": TagGroup((1, 2), fitted.bias_curve, fitted.sigma_curve)}
+    groups = {"a": model.TagGroup((1, 2), fitted.bias_curve, fitted.sigma_curve)}
     groups["b"] = replace(groups["a"], tags=(3, 7))
     grouped = replace(fitted, groups=groups)
     for form in ("miluv", "ros-yaml", "c-header"):

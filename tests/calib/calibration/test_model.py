@@ -7,9 +7,7 @@ from dataclasses import replace
 import duckdb
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
-from scipy.signal import lfilter
-from scipy.stats import exponnorm, norm
+from scipy import interpolate, signal, stats
 
 import calib
 from calib.calibration.error_model import ErrorModel, PairErrors
@@ -70,7 +68,7 @@ def test_ranges_are_corrected_by_the_formulas(fitted, lift, power_at, grouped, p
     (i, j), share = ends, sum(tag > 2 for tag in ends) / 2 if grouped else 0.0
     found = known.correct(3.0, *printed, i, j, weights=(0.5, 0.50001))
     delays = SPEED_OF_LIGHT * 1e-9 * (0.5 * known.delays_ns[i] + 0.50001 * known.delays_ns[j])
-    spline, at = BSpline(curve.knots, curve.coefficients, 3), powers_at(lift, power_at, *both)
+    spline, at = interpolate.BSpline(curve.knots, curve.coefficients, 3), powers_at(lift, power_at, *both)
     bias = np.mean([spline(np.clip(one, *curve.range)) for one in at]) - 0.1 * share
     assert found.range_m == pytest.approx(3.0 + delays - bias, abs=1e-9)
     assert type(found.range_m) is float
@@ -301,9 +299,9 @@ def test_probabilities_given_an_error_agree_with_scipy():
     model = replace(MODEL, outlier_share=0.05, outlier_m=3.0)
     error = np.linspace(-1, 4, 101)
     shapes = model.shapes(np.full(101, 0.5), np.full(101, 3), np.full(101, 7))
-    core = 0.95 * 0.8 * norm.pdf(error - 0.02, scale=0.05)
-    tail = 0.95 * 0.2 * exponnorm.pdf(error - 0.02, 0.3 / 0.05, loc=0.05, scale=0.05)
-    wild = 0.05 * norm.pdf(error - 0.02, scale=3.0)
+    core = 0.95 * 0.8 * stats.norm.pdf(error - 0.02, scale=0.05)
+    tail = 0.95 * 0.2 * stats.exponnorm.pdf(error - 0.02, 0.3 / 0.05, loc=0.05, scale=0.05)
+    wild = 0.05 * stats.norm.pdf(error - 0.02, scale=3.0)
     found = model.tail_given(error, shapes)
     np.testing.assert_allclose(found, [tail / (core + tail + wild), wild / (core + tail + wild)], atol=1e-9)
 
@@ -370,7 +368,7 @@ def test_a_fit_estimates_the_persistence_of_errors():
     """Half of the variance is a Gauss-Markov process of each pair with a correlation time of half a second."""
     flight, keep = calib.load_ranges(calib.sample_flight(9000)), np.exp(-0.03 / 0.5)
     steps = np.random.default_rng(5).normal(0, 0.03 * np.sqrt(1 - keep**2), (3000, 3))
-    shared = lfilter([1.0], [1.0, -keep], steps, axis=0).ravel()
+    shared = signal.lfilter([1.0], [1.0, -keep], steps, axis=0).ravel()
     found = calib.fit(replace(flight, raw_m=flight.raw_m + shared)).calibration
     lasting = found.errors.lasting
     assert lasting.lasting_variance == pytest.approx(0.5, abs=0.1)

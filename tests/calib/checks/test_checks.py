@@ -21,10 +21,9 @@ from calib.checks.examine import CHECKS, FINDING_LEVEL, IMPLIED
 from calib.data.sources import RecordedSource
 from calib.findings import BUDGET, CERTAIN, FIT_LEVELS, OF_A_FIT, Candidate, Check, exceeds
 from docs.site import checks
-from tests import processes
+from tests import processes, shared_data
 from tests.calib.fitting.fields import ranges_with_field
 from tests.calib.synthetic import about_their_mean, lifted
-from tests.shared_data import ROOT, rows_of, shared
 from uwblink.recording.distances import distances_m
 
 RNG = np.random.default_rng
@@ -106,8 +105,8 @@ RADIOS = {11: 10, 7: 11, 4: 12, 10: 13, 5: 15, 6: 16, 12: 6, 9: 9}
 
 @pytest.fixture(scope="module")
 def starloc():
-    markers = {int(row[""]): [row[k] for k in "xyz"] for row in rows_of(STARLOC_DATA, "uwb_markers_v1.csv")}
-    return rows_of(STARLOC_DATA, "loop-2d-fast_s1/uwb.csv"), markers
+    markers = {int(row[""]): [row[k] for k in "xyz"] for row in shared_data.rows_of(STARLOC_DATA, "uwb_markers_v1.csv")}
+    return shared_data.rows_of(STARLOC_DATA, "loop-2d-fast_s1/uwb.csv"), markers
 
 
 @pytest.mark.parametrize(
@@ -155,7 +154,7 @@ def test_equal_coarse_ranges_are_not_doubled_exchanges(tmp_path):
 
 @pytest.mark.slow
 def test_logs_of_both_robots_are_doubled_exchanges(tmp_path):
-    logged = rows_of("miluv_cirObstacles_3_random_0.tar.xz", "uwb_range.csv")
+    logged = shared_data.rows_of("miluv_cirObstacles_3_random_0.tar.xz", "uwb_range.csv")
     names = {"time_s": "timestamp", **{name: f"{name}_raw" for name in STAMPS}, "range_m": "range_raw"}
     names |= {name: name for name in ("from_id", "to_id", "fpp1", "fpp2", "skew1", "skew2")}
     names |= {"gt_range_m": "gt_range"}
@@ -171,8 +170,8 @@ def test_logs_of_both_robots_are_doubled_exchanges(tmp_path):
 
 def test_power_and_distance_are_not_confounded_outdoors(tmp_path):
     """Two boards on tripods, 2 to 60 m apart: distance explains 82 % of the power, which still determines a curve."""
-    table = shared("hanyang_sstwr.csv.gz")
-    uwblink.import_recording(table, tmp_path / "h.uwb", map_file=ROOT / "docs" / "maps" / "hanyang.toml")
+    table = shared_data.shared("hanyang_sstwr.csv.gz")
+    uwblink.import_recording(table, tmp_path / "h.uwb", map_file=shared_data.ROOT / "docs" / "maps" / "hanyang.toml")
     # A pole and a tripod do not move, so reflections last as long as they stand.
     assert {one.fault for one in calib.examine(tmp_path / "h.uwb")} == {
         "too few pairs",

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
-from scipy.stats import t as student
+from scipy import signal, stats
 
 import calib
 from benchmarks.worlds import CLEAN, LIGHT_M_PER_NS, Recipe, make
@@ -18,8 +17,8 @@ from calib.estimator.score_tests import Slopes
 from calib.estimator.time_blocks import TimeBlocks, persistence, time_blocks
 from calib.estimator.to_calibration import mean_variance
 from calib.spread import students_factor
+from tests import shared_data
 from tests.calib import synthetic
-from tests.shared_data import rows_of
 
 
 def fitted(recipe, seed=12_003, **settings):
@@ -47,7 +46,7 @@ def test_least_squares_of_delays_alone_and_its_variances_agree_with_numpy():
     inverse = np.linalg.inv(matrix.T @ matrix)
     plain = inverse @ sums.T @ sums @ inverse * len(ranges) / (len(ranges) - len(tags))
     np.testing.assert_allclose(
-        whole, plain * lasting.factor * (student.ppf(0.975, lasting.freedom) / 1.959964) ** 2, rtol=2e-3
+        whole, plain * lasting.factor * (stats.t.ppf(0.975, lasting.freedom) / 1.959964) ** 2, rtol=2e-3
     )
 
 
@@ -97,7 +96,7 @@ def walk(keep, share, rng, blocks=800, columns=4):
     """Return noise of which a share is persistent, with the resulting factor on the variance of a mean."""
     steps = np.sqrt(1 - keep**2) * rng.normal(size=(blocks, columns))
     steps[0] = rng.normal(size=columns)
-    memory = lfilter([1.0], [1.0, -keep], steps, axis=0)
+    memory = signal.lfilter([1.0], [1.0, -keep], steps, axis=0)
     series = np.sqrt(share) * memory + np.sqrt(1 - share) * rng.normal(size=(blocks, columns))
     return series - series.mean(axis=0), 1 + 2 * share * keep / (1 - keep)
 
@@ -171,7 +170,7 @@ def test_offsets_of_few_pairs_widen_intervals_as_in_regression(count):
     covariance = apart @ np.linalg.inv(rows.T @ rows) @ apart * squares / freedom
     mine = apart @ result.calibration.covariance_ns2(range(1, count + 1)) @ apart
     # The noise of a mean, 1 mm, and the tolerance of the search.
-    half = student.ppf(0.975, freedom) * np.sqrt(np.diag(covariance))
+    half = stats.t.ppf(0.975, freedom) * np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(1.96 * np.sqrt(np.diag(mine)), half, rtol=0.03)
     assert not seen
 
@@ -280,7 +279,7 @@ def starloc():
     """Ranges of two flights of STAR-loc: two tags on a rig, eight anchors."""
     flights = []
     for name in ("loop-2d-fast_s1", "loop-2d-fast_s2"):
-        every = rows_of("starloc_loop-2d-fast.tar.xz", f"{name}/uwb.csv")
+        every = shared_data.rows_of("starloc_loop-2d-fast.tar.xz", f"{name}/uwb.csv")
         rows = [row for row in every if row["range"] and row["gt_range"]]
         names = ("range", "from_id", "to_id", "fpp1", "fpp2", "gt_range", "time_s")
         range_m, initiator, target, fpp1, fpp2, truth_m, time_s = (

@@ -8,10 +8,7 @@ from scipy import optimize, sparse
 
 import calib
 from benchmarks.worlds import FIRST_REPORTED, Recipe, make
-from calib.estimator import rows, unknowns
-from calib.estimator.grouped_errors import error_unknowns, fit_grouped_errors, scattered
-from calib.estimator.inverse import SparseInverse, inverse_of, trace_of_product
-from calib.estimator.known_distances import fit_known_distances
+from calib.estimator import grouped_errors, inverse, known_distances, rows, unknowns
 from calib.estimator.optimize import maximize
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows, sum_rows
@@ -24,13 +21,13 @@ def test_an_arrow_is_inverted_as_the_dense_matrix_is():
     entries = sparse.csr_matrix((rng.normal(size=3600), columns.ravel(), np.arange(601) * 6), shape=(600, 107))
     matrix = sparse.csc_matrix(entries.T @ entries)
     free = np.flatnonzero(np.arange(107) != 50)
-    found, dense = inverse_of(matrix, free), inverse_of(matrix.toarray(), free)
-    assert isinstance(found, SparseInverse)
+    found, dense = inverse.inverse_of(matrix, free), inverse.inverse_of(matrix.toarray(), free)
+    assert isinstance(found, inverse.SparseInverse)
     assert found[:, :] == pytest.approx(dense, rel=1e-6, abs=1e-9)
     assert found[3:9, 3:9] == pytest.approx(dense[3:9, 3:9], rel=1e-6, abs=1e-9)
     right = rng.normal(size=(107, 2))
     assert found @ right == pytest.approx(dense @ right, rel=1e-6, abs=1e-9)
-    assert trace_of_product(found, matrix) == pytest.approx(106, rel=1e-2)
+    assert inverse.trace_of_product(found, matrix) == pytest.approx(106, rel=1e-2)
 
 
 @pytest.mark.parametrize("most", [0, 400])
@@ -62,7 +59,7 @@ def test_a_search_finds_the_power_of_units_of_a_prior(most, monkeypatch):
     seen = 0.5 * np.exp(0.6 * (unit - unit.mean())) * rng.normal(size=400) + rng.normal(0, 0.1, 400)
     blocks = (
         unknowns.Unknown(kind="unit", names=names, start=unit, known=np.ones(400, dtype=bool)),
-        scattered("offset", names, (0.1, 1e-3, 10.0), unit="unit"),
+        grouped_errors.scattered("offset", names, (0.1, 1e-3, 10.0), unit="unit"),
     )
     layout = unknowns.Layout(blocks)
     every = NormalRows(
@@ -87,7 +84,7 @@ def test_a_search_finds_the_power_of_units_of_a_prior(most, monkeypatch):
     ids=["world", "listeners"],
 )
 def test_a_search_ends_at_one_optimum_of_unknowns_and_weights(data):
-    found = fit_known_distances(calib.load_ranges(data()), calib.FitSettings())
+    found = known_distances.fit_known_distances(calib.load_ranges(data()), calib.FitSettings())
     search, optimum = found.searches[0], found.searches[0].optimum
     rows = [own for own in (search.rows, search.heard, *search.gauge) if own is not None]
     asked = optimum.layout.indices([unknown.kind for unknown in found.model.unknowns])
@@ -124,7 +121,7 @@ def mixed(n=40_000, share=0.12, mean_m=0.35, outlier=0.0, seed=3):
     ids=["one kind", "outliers", "no reflections", "long detours"],
 )
 def test_the_parts_of_errors_are_found(planted):
-    found = fit_grouped_errors(mixed(**planted))
+    found = grouped_errors.fit_grouped_errors(mixed(**planted))
     # 20,000 errors determine the centre to 0.6 and 1.2 mm and a sigma to 0.5 %; three times that are allowed.
     np.testing.assert_allclose(found.centre_m, [0.03, 1.0], atol=0.0035)
     np.testing.assert_allclose(found.sigma_m, [0.06, 0.12], rtol=0.02)
@@ -178,7 +175,7 @@ def test_few_ranges_determine_how_much_the_noise_of_groups_differs(spread):
     rng = np.random.default_rng(6)
     noise = 0.05 * np.exp(spread * rng.normal(size=(300, 1)))
     group, names = np.repeat(np.arange(300), 4), ("",) * 300
-    blocks, parts = error_unknowns(0.05, names, group)
+    blocks, parts = grouped_errors.error_unknowns(0.05, names, group)
     prior = unknowns.Prior.of_deviation(1e-3)
     blocks.append(unknowns.Unknown(kind="offset", names=names, start=np.zeros(300), priors=(prior,)))
     parts.append(Part(parameter=RESIDUAL, kind="offset", columns=group[:, None], values=np.full((1200, 1), -1.0)))

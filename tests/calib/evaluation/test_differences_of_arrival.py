@@ -9,9 +9,7 @@ from scipy.interpolate import BSpline
 
 import calib
 from calib.data.sources import load_flight
-from calib.evaluation import IMUS, Settings, localization_json, localization_text, summarize
-from calib.evaluation.models import FilterRanges
-from calib.evaluation.tracking import problems, run_filters
+from calib.evaluation import IMUS, Settings, localization_json, localization_text, models, summarize, tracking
 from tests import processes
 from tests.calib.synthetic import calibration, track_errors
 from uwbsim import Scenario, simulate
@@ -133,11 +131,11 @@ def test_a_robot_that_never_sends_is_localized(known, heard):
 
 @pytest.mark.slow
 def test_constants_of_both_pairs_in_a_difference_are_followed(heard):
-    (problem,), rng = problems(load_flight(heard)), np.random.default_rng(6)
+    (problem,), rng = tracking.problems(load_flight(heard)), np.random.default_rng(6)
     true_m, zero = problem.ranges.arrivals.truth_m[problem.rows - len(problem.ranges)], np.zeros(len(problem))
     offsets_m = np.sum(problem.sign * rng.normal(0, 0.1, problem.pair.max() + 1)[problem.pair], axis=1)
-    one = FilterRanges(true_m + offsets_m + rng.normal(0, 0.05, len(zero)), zero + 0.05, zero, 0 * problem.sign)
-    tracks = run_filters(
+    one = models.FilterRanges(true_m + offsets_m + rng.normal(0, 0.05, len(zero)), zero + 0.05, zero, 0 * problem.sign)
+    tracks = tracking.run_filters(
         problem, {"fixed": one, "own": replace(one, offset_m=0.1, rivals=1)}, replace(LISTEN, gate=1e9)
     )
     own, fixed = (np.mean([track.rmse_m for track in tracks[name]]) for name in ("own", "fixed"))

@@ -7,23 +7,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib import BadInputError, OnboardSettings, UnanswerableError, localize_onboard
-from calib.calibration import read_miluv
-from calib.calibration.error_model import ErrorModel
-from calib.calibration.patterns import Pattern
+from calib.calibration import error_model, patterns, read_miluv
 from calib.data.samples import stamped
-from calib.evaluation import onboard_json, onboard_text, write_tum
-from calib.evaluation.filters import ProcessNoise, multilaterate
+from calib.evaluation import filters, onboard_json, onboard_text, write_tum
 from tests.calib import synthetic
 from tests.calib.evaluation.inertial import readings, table
 from tests.calib.synthetic import track_errors
 from tests.shared_data import miluv, shared
-from uwblink import Contents, Poses, Tag, raw_range
-from uwblink.importers import read_source
+from uwblink import Contents, Poses, Tag, importers, raw_range
 
 ANCHORS = np.array([[3, 3, 0.3], [-3, 3, 2.2], [-3, -3, 0.4], [3, -3, 2.4], [0, 3.5, 1.2], [3.5, 0, 1.4]])
 ARMS = {10: (0.15, -0.15, -0.05), 11: (-0.15, 0.15, -0.05)}
 NOISE_M, NS = 0.05, 10**12
-IMU = ProcessNoise(force=0.02, gyro=0.002, force_bias=0.001, gyro_bias=0.0001, height_offset=0.001)
+IMU = filters.ProcessNoise(force=0.02, gyro=0.002, force_bias=0.001, gyro_bias=0.0001, height_offset=0.001)
 BIASES = np.array([0.004, -0.006, 0.003]), np.array([0.15, -0.1, 0.08])
 
 
@@ -79,7 +75,7 @@ def ns(time_s):
 
 def calibration(share=0.001):
     tags = [*range(len(ANCHORS)), *ARMS]
-    errors = ErrorModel(
+    errors = error_model.ErrorModel(
         lifted=(0.1, 1.0), noise_m=(NOISE_M,) * 2, tail_share=(share,) * 2, least_m=0.0, detour_m=0.35,
         outlier_share=1e-4, outlier_m=3.0,
     )  # fmt: skip
@@ -114,7 +110,9 @@ def test_the_filter_is_consistent(seed):
     assert np.mean(found_out.nis[len(found_out.nis) // 2 :]) > 2
 
 
-@pytest.mark.parametrize(("model", "noise", "most_m"), [("imu", IMU, 0.5), ("constant-velocity", ProcessNoise(), 0.7)])
+@pytest.mark.parametrize(
+    ("model", "noise", "most_m"), [("imu", IMU, 0.5), ("constant-velocity", filters.ProcessNoise(), 0.7)]
+)
 @pytest.mark.parametrize("away", [(-3.0, 4.0, 0.0), (0.0, -10.0, 0.0)])
 def test_a_wrong_start_is_left_within_two_seconds(model, noise, most_m, away):
     settings = OnboardSettings(model=model, noise=noise, start_m=tuple((place(np.array(0.0)) + away).tolist()))
@@ -174,7 +172,7 @@ def with_patterns(found, size_m):
     power = np.full((2, len(t)), -85.0)
     exchanges = stamped(x.time_ns, np.column_stack([x.initiator, x.target]), raw_range(x) + longer, power)
     front = (size_m / np.sqrt(3), *[0.0] * 7)
-    pattern = Pattern((2, 10, 11), front, (0.0,) * 8, ((0.0,) * 8,) * 8, size_m / np.sqrt(3))
+    pattern = patterns.Pattern((2, 10, 11), front, (0.0,) * 8, ((0.0,) * 8,) * 8, size_m / np.sqrt(3))
     there = replace(found, exchanges=exchanges, poses=replace(poses, quaternion=quaternion))
     return there, replace(calibration(), patterns=(pattern,))
 
@@ -234,18 +232,18 @@ def test_recordings_without_needed_data_are_refused(change, settings, error, sai
 def test_multilateration_is_exact_and_leaves_a_reflection_out():
     true = np.array([0.7, -1.1, 1.9])
     exact = np.linalg.norm(true - ANCHORS, axis=1)
-    np.testing.assert_allclose(multilaterate(exact, ANCHORS, 0.0).place_m, true, atol=1e-6)
+    np.testing.assert_allclose(filters.multilaterate(exact, ANCHORS, 0.0).place_m, true, atol=1e-6)
     twice, reflected = np.tile(ANCHORS, (2, 1)), np.tile(exact, 2)
     reflected[[2, 9]] += 3.0, 0.8
-    assert np.linalg.norm(multilaterate(reflected, twice, 0.0).place_m - true) < 0.15
+    assert np.linalg.norm(filters.multilaterate(reflected, twice, 0.0).place_m - true) < 0.15
     # Three anchors leave two mirrored positions, between which a height decides.
-    assert multilaterate(exact[:3], ANCHORS[:3] * [1, 1, 0] + [0, 0, 1.0], 0.0, 1.9).place_m[2] > 1.0
+    assert filters.multilaterate(exact[:3], ANCHORS[:3] * [1, 1, 0] + [0, 0, 1.0], 0.0, 1.9).place_m[2] > 1.0
 
 
 @pytest.mark.slow
 def test_a_real_flight_by_imu_height_and_ranges_alone(tmp_path):
     """The flight of the data set among obstacles: a range to an anchor every 1.2 s, gaps of 6 s, published delays."""
-    contents = read_source(miluv(tmp_path), importer="miluv")
+    contents = importers.read_source(miluv(tmp_path), importer="miluv")
     tracks = localize_onboard(contents, read_miluv(shared("miluv_published_calibration.json")))
     rmse_m = {track.body: track.rmse_m for track in tracks}
     # Measured: 0.80, 0.98 and 1.10 m.

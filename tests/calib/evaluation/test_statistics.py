@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.interpolate import make_interp_spline
-from scipy.stats import norm
+from scipy import interpolate, stats
 
 import calib
 from calib.data.ranges import Ranges, concatenate
@@ -19,7 +18,7 @@ from uwblink import SPEED_OF_LIGHT
 @pytest.mark.parametrize(("pairs_m", "sessions_m"), [(0.0, 0.0), (0.05, 0.0), (0.05, 0.04)])
 def test_errors_are_split_into_within_and_between_pairs_and_sessions(pairs_m, sessions_m):
     rng, (first, second) = np.random.default_rng(7), np.triu_indices(8, 1)
-    spread, session = norm.ppf((np.arange(28) + 0.5) / 28), np.arange(16_000) // 4000
+    spread, session = stats.norm.ppf((np.arange(28) + 0.5) / 28), np.arange(16_000) // 4000
     own_m = pairs_m * spread + sessions_m * np.array([rng.permutation(spread) for _ in range(4)])
     pair = rng.integers(0, 28, 16_000)
     error = own_m[session, pair] + rng.normal(0, 0.04, 16_000) + 2.0 * (np.arange(16_000) % 4000 < 200)  # reflections
@@ -35,7 +34,7 @@ def test_errors_are_split_into_within_and_between_pairs_and_sessions(pairs_m, se
 
 
 def test_evaluations_compare_with_planted_values():
-    curve = make_interp_spline(np.linspace(-0.5, 2.5, 60), bias_m(np.linspace(-0.5, 2.5, 60)))
+    curve = interpolate.make_interp_spline(np.linspace(-0.5, 2.5, 60), bias_m(np.linspace(-0.5, 2.5, 60)))
     planted: dict[str, object] = {"delays_ns": {str(t): d for t, d in DELAYS_NS.items()}}
     planted["bias_curve"] = {"knots": curve.t.tolist(), "coefficients": curve.c.tolist(), "degree": 3}
     r = replace(ranges(), planted=planted)

@@ -15,8 +15,7 @@ import calib
 import uwbsim
 from calib.calibration.patterns import Pattern
 from calib.data.samples import stamped
-from calib.evaluation.filters import IMUS, ProcessNoise
-from calib.evaluation.team import team_json, team_text
+from calib.evaluation import filters, team
 from tests import processes
 from tests.calib.evaluation.inertial import readings, table
 from tests.calib.synthetic import calibration
@@ -27,7 +26,7 @@ ARMS = {1: (0.2, -0.15, 0.1), 2: (-0.2, 0.15, -0.1), 3: (0.15, 0.2, 0.1), 4: (-0
         5: (0.25, 0.0, -0.1), 6: (-0.2, 0.1, 0.1)}  # fmt: skip
 NOISE_M = 0.02
 RATE_HZ, NS = 100.0, 10**12
-EXACT = ProcessNoise(force=1e-9, gyro=1e-9, force_bias=0.0, gyro_bias=0.0, force_start=0.02, gyro_start=0.002)
+EXACT = filters.ProcessNoise(force=1e-9, gyro=1e-9, force_bias=0.0, gyro_bias=0.0, force_start=0.02, gyro_start=0.002)
 
 
 def place(robot, t):
@@ -206,7 +205,7 @@ def known():
     return calib.fit(simulated(300, 60.0), use="receptions").calibration
 
 
-LISTEN = calib.TeamSettings(use="receptions", noise=IMUS["industrial"])
+LISTEN = calib.TeamSettings(use="receptions", noise=filters.IMUS["industrial"])
 
 
 @pytest.mark.slow
@@ -214,7 +213,7 @@ def test_relative_poses_of_three_quadcopters_are_consistent(known):
     """Three flights as in the paper, with seeds that were chosen before."""
     heard = [one for seed in (301, 302, 303) for one in calib.localize_team(simulated(seed, 12.0), known, LISTEN)]
     assert [(one.body, one.reference) for one in heard] == 3 * [("robot2", "robot1"), ("robot3", "robot1")]
-    found = team_json(heard)
+    found = team.team_json(heard)
     figures, less = found["summary"], found["reduction_by_listening"]
     rmse_m = {name: one["rmse_m"] for name, one in figures.items()}
     # Ranges have 5 cm of noise, and baselines of half a metre determine directions over three metres.
@@ -229,7 +228,7 @@ def test_relative_poses_of_three_quadcopters_are_consistent(known):
         assert high - low < 2.5
     assert figures["raw"]["nees"] > 50
     assert figures["variance"]["accepted"] > 0.995
-    text = team_text(heard, LISTEN)
+    text = team.team_text(heard, LISTEN)
     assert f"{figures['variance']['rmse_m']:.3f}" in text
     assert "compared with ranges only: raw" in text
 

@@ -12,9 +12,7 @@ import pytest
 import calib
 import uwblink
 from benchmarks.directions import Recipe, flight, pattern_m
-from calib.report import Picture
-from calib.report.results import Results
-from calib.report.sections import SECTIONS
+from calib.report import Picture, results, sections
 from tests.processes import refuse, run, succeed
 from uwblink.pages.figures import drawn
 from uwblink.recording.distances import antennas_m
@@ -220,7 +218,7 @@ def test_files_keep_patterns_and_older_programs_refuse_them():
 
 def test_the_report_draws_patterns_with_their_bands_at_the_level_of_flight():
     known, flown_ranges = fitted(SHORT, 3).calibration, fitted(SHORT, 3).ranges
-    *_, picture = SECTIONS["patterns"](Results(calibration=known, training=[flown_ranges]))
+    *_, picture = sections.SECTIONS["patterns"](results.Results(calibration=known, training=[flown_ranges]))
     assert isinstance(picture, Picture)
     (axes,), (pattern,) = picture.draw(7.0).axes, known.patterns
     # Robots tilt: the median of the flown elevations, the 10 % and 90 % quantiles, and the circle of zero.
@@ -237,9 +235,9 @@ def test_the_report_draws_patterns_with_their_bands_at_the_level_of_flight():
     edges = axes.collections[0].get_paths()[0].vertices[:, 1]
     assert np.ptp(edges) > np.ptp(lines[0].get_ydata()) + 196 * pattern.std_m(values).min()
     # A page shows values at the pointer for straight axes, and not for these. Without ranges there is one line.
-    one = SECTIONS["patterns"](Results(calibration=known))[-1].draw
+    one = sections.SECTIONS["patterns"](results.Results(calibration=known))[-1].draw
     assert (len(one(3.5).axes[0].lines), b"names" in drawn(one, 7.0, ["svg"])["svg"]) == (2, False)
-    assert SECTIONS["patterns"](Results(calibration=replace(known, patterns=()))) == []
+    assert sections.SECTIONS["patterns"](results.Results(calibration=replace(known, patterns=()))) == []
 
 
 def test_a_stream_knows_no_directions_and_its_total_sigma_contains_the_pattern(tmp_path):

@@ -13,8 +13,7 @@ import uwblink
 from benchmarks.held_back import judged, parts, samples
 from benchmarks.nlos import room
 from benchmarks.worlds import CLEAN, Recipe, make
-from calib.calibration.formats import read_miluv
-from calib.calibration.power_curves import ALPHA_DBM
+from calib.calibration import formats, power_curves
 from calib.data.features import response_features
 from calib.online import range_errors
 from tests.calib.synthetic import about_their_mean
@@ -79,7 +78,7 @@ def test_pairs_have_the_share_of_reflections_that_was_planted():
 def test_a_power_beyond_the_curve_widens_the_total():
     known = calib.fit(calib.sample_flight()).calibration
     low, high = known.bias_curve.range
-    power = ALPHA_DBM + 10 * np.log10([high, 1.5 * high, 3 * high])
+    power = power_curves.ALPHA_DBM + 10 * np.log10([high, 1.5 * high, 3 * high])
     ranges = calib.Ranges.from_arrays(np.full(3, 3.0), initiator=1, target=2, fpp1_dbm=power, fpp2_dbm=power)
     total = known.apply(ranges).sigma_total_m
     step = 0.1 * (high - low)
@@ -124,7 +123,7 @@ def test_fits_of_few_ranges_converge(seed):
 @pytest.mark.slow
 def test_a_real_flight_among_obstacles_agrees_with_the_published_delays(tmp_path):
     ranges = calib.load_ranges(read_source(miluv(tmp_path), importer="miluv"))
-    published = read_miluv(shared("miluv_published_calibration.json"))
+    published = formats.read_miluv(shared("miluv_published_calibration.json"))
     known = calib.fit(ranges, loss="cauchy").calibration
     error, std = about_their_mean(known, {tag: published.delays_ns[tag] for tag in known.uncertainty.tags})
     ours, theirs = (each.apply(ranges).delay_corrected_m for each in (known, published))

@@ -13,8 +13,7 @@ import pytest
 import calib
 import uwblink
 from benchmarks.directions import Recipe, flight
-from calib.calibration import held_out_line
-from calib.calibration.patterns import TemperatureSlope
+from calib.calibration import held_out_line, patterns
 from calib.data.ranges import read_c
 from tests.calib import overhearing
 from tests.processes import refuse, run
@@ -197,7 +196,7 @@ def test_differences_of_arrival_are_corrected_for_the_temperature_of_their_targe
     warm = calib.load_ranges(replace(found, temperature=readings), use="receptions")
     # A tag that adds x to a range has a delay that is smaller by 2 x over the speed of light.
     moved = {tag: known.delays_ns[tag] - 0.008 * tag / 0.299702547 for tag in known.delays_ns}
-    slope = TemperatureSlope(tuple(tags.tolist()), 0.004, 0.0, 20.0, (10.0, 40.0))
+    slope = patterns.TemperatureSlope(tuple(tags.tolist()), 0.004, 0.0, 20.0, (10.0, 40.0))
     by_slope, by_delays = replace(known, temperatures=(slope,)), replace(known, delays_ns=moved)
     expected = pytest.approx(by_delays.correct_arrivals(warm).corrected_m, abs=1e-6)
     assert by_slope.correct_arrivals(warm).corrected_m == expected

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import calib
-from benchmarks import surveys
-from benchmarks.standing import places_of, standing_boards
+from benchmarks import standing, surveys
 from calib.planning.surveys import PLANNED_CURVE_STD_M, POWER_AT_1_M_DBM, delay_information, predict
 from tests.processes import succeed
 
@@ -99,7 +98,7 @@ def test_the_gain_of_a_measured_distance_is_as_predicted():
 def test_plans_agree_with_surveys():
     plan = calib.plan(4, on="line", arrangements=7)
     places = [np.array([a.place_m[t] for t in plan.tags]) for a in plan.arrangements]
-    result = calib.survey(standing_boards(3, places=places).ranges, known="line", pair_error_m=0.02)
+    result = calib.survey(standing.standing_boards(3, places=places).ranges, known="line", pair_error_m=0.02)
     found = np.array([1.96 * result.calibration.delays_std_ns[t] for t in plan.tags])
     assert found == pytest.approx(np.array([plan.half_ns[t] for t in plan.tags]), rel=0.1)
 
@@ -154,7 +153,7 @@ def test_three_boards_in_a_row_are_not_used_if_a_pair_is_mostly_reflected():
 def test_reflected_pairs_cost_the_information_of_missing_pairs():
     """Compared with draws over the same arrangements, in which reflected pairs are left out."""
     rng, pairs = np.random.default_rng(5), np.array(list(itertools.combinations(range(6), 2)))
-    places = [places_of(rng, 6, 2, 4.0, 0.4) for _ in range(6)]
+    places = [standing.places_of(rng, 6, 2, 4.0, 0.4) for _ in range(6)]
     first, second = (np.eye(6)[pairs[:, end]] for end in (0, 1))
     of_draws = []
     for _ in range(30):
@@ -178,7 +177,7 @@ def test_reflected_pairs_cost_the_information_of_missing_pairs():
 def test_a_curve_costs_the_information_of_a_process_of_its_size(monkeypatch):
     """The formula of the benchmark has the process itself; plan and survey have splines."""
     monkeypatch.setattr(surveys, "power_dbm", lambda length: POWER_AT_1_M_DBM - 20 * math.log10(length))
-    world = standing_boards(3, "plane", boards=5, arrangements=5, size_m=6.0, each=5)
+    world = standing.standing_boards(3, "plane", boards=5, arrangements=5, size_m=6.0, each=5)
     expected = surveys.promised(world, 2, PLANNED_CURVE_STD_M, 0.0)
     found = predict(given(5, "plane"), surveys.planned(world.places), curve=True)[-1].each
     assert found == pytest.approx(expected, rel=0.1)

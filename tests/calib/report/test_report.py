@@ -13,11 +13,10 @@ from calib.fitting.fitting import fit
 from calib.report import Table
 from calib.report.results import Results
 from calib.report.sections import SECTIONS
-from tests.browser import chromium, lies_well
+from tests import browser, shared_data
 from tests.calib.report import page_of_numpy
 from tests.calib.synthetic import ranges
 from tests.processes import succeed as run
-from tests.shared_data import ROOT
 from uwblink import load
 
 TEST = "<script>alert(1)<script>"
@@ -31,7 +30,15 @@ def campaign(tmp_path_factory):
     for name, seed in (("train", 1), (TEST, 2)):
         settings = [f"run.seed={seed}", "run.duration_s=6", "tags.0.passive=true"]
         options = [word for setting in settings for word in ("--set", setting)]
-        run("uwbsim", "run", ROOT / "scenarios/icra2023/train.toml", "-o", f"{name}.uwb", *options, cwd=folder)
+        run(
+            "uwbsim",
+            "run",
+            shared_data.ROOT / "scenarios/icra2023/train.toml",
+            "-o",
+            f"{name}.uwb",
+            *options,
+            cwd=folder,
+        )
     words = f"report train.uwb --tests {TEST}.uwb -o r.html --json"
     (folder / "r.json").write_text(run("calib", *words.split(), cwd=folder).stdout)
     return folder
@@ -79,8 +86,8 @@ def test_the_json_contains_the_results_of_the_page(campaign):
 def test_a_browser_shows_the_report(campaign, tmp_path, width):
     picture = tmp_path / "page.png"
     words = (f"--window-size={width},2400", f"--screenshot={picture}", (campaign / "r.html").as_uri())
-    chromium(*words, profile=tmp_path / "profile")
-    lies_well((campaign / "r.html").read_text(), width, tmp_path)
+    browser.chromium(*words, profile=tmp_path / "profile")
+    browser.lies_well((campaign / "r.html").read_text(), width, tmp_path)
     pixels = imread(picture)
     assert pixels.shape[:2] == (2400, width)
     # Text and figures from top to bottom: no band of the page is blank.

@@ -8,8 +8,7 @@ import pytest
 from scipy.special import betaln, ndtr
 
 import calib
-from benchmarks.standing import standing_boards
-from benchmarks.surveys import orders_of
+from benchmarks import standing, surveys
 from calib.surveys.network import Case
 from calib.surveys.recordings import read_surveys
 from calib.surveys.reflections import Marks
@@ -24,7 +23,7 @@ PAIR_M, CURVE_M = 0.02, 0.03
 @pytest.fixture(scope="module")
 def linear():
     """Return marks of three arrangements on a line, none set, and a function for the explicit likelihood of marks."""
-    world = standing_boards(11, boards=4, arrangements=3, reflected=0.12)
+    world = standing.standing_boards(11, boards=4, arrangements=3, reflected=0.12)
     knowledge = calib.Knowledge(shape="line")
     network = network_of(read_surveys(world.ranges, knowledge), knowledge, {}, curve=False)
     x, free = first_start(network), network.layout.free()
@@ -78,7 +77,7 @@ def reflected(world, arrangement, first, second, longer_m):
 
 
 def test_planted_reflections_are_named_and_delays_are_as_good_as_without():
-    world = standing_boards(21, boards=5, arrangements=7)
+    world = standing.standing_boards(21, boards=5, arrangements=7)
     planted = {(0, 1, 3): 0.35, (2, 2, 5): 0.2, (3, 1, 4): 0.5, (3, 2, 3): 0.25, (6, 4, 5): 0.3}
     longer = sum(reflected(world, *where, much) for where, much in planted.items())
     result = calib.survey(replace(world.ranges, raw_m=world.ranges.raw_m + longer), known="line")
@@ -103,7 +102,7 @@ def test_planted_reflections_are_named_and_delays_are_as_good_as_without():
 
 def test_reflections_do_not_shorten_ranges():
     """Two ranges 40 cm too short explain these as well as reflections do, with one delay 1.4 ns off."""
-    world = standing_boards(1034, boards=5, arrangements=8, reflected=0.1)
+    world = standing.standing_boards(1034, boards=5, arrangements=8, reflected=0.1)
     found = calib.survey(world.ranges, known="line")
     assert all(one.longer_m > -0.1 for one in found.reflected)
     for tag, delay in world.delays_ns.items():
@@ -111,7 +110,7 @@ def test_reflections_do_not_shorten_ranges():
 
 
 def test_ambiguous_reflections_are_stated_and_widen_intervals():
-    world = standing_boards(5, boards=3, arrangements=6, pair_error_m=0.01)
+    world = standing.standing_boards(5, boards=3, arrangements=6, pair_error_m=0.01)
     longer = reflected(world, 1, 1, 2, 0.4)
     result = calib.survey(replace(world.ranges, raw_m=world.ranges.raw_m + longer), known="line")
     # For three boards on a line, any of the three ranges may be the wrong one, too long or too short.
@@ -126,12 +125,12 @@ def test_ambiguous_reflections_are_stated_and_widen_intervals():
 # Stated orders of boards: exchanged labels are named, correct ones are not, and ambiguous ones are stated.
 
 
-FIVE = standing_boards(4, boards=5, arrangements=5, reflected=0.05, each=20)
+FIVE = standing.standing_boards(4, boards=5, arrangements=5, reflected=0.05, each=20)
 
 
 def said_with(world, exchange=None):
     """Return the known facts: the line, and the true orders except for exchanged labels (arrangement, one, other)."""
-    orders = orders_of(world, None)[0]
+    orders = surveys.orders_of(world, None)[0]
     for name, one, other in exchange or ():
         swap = {one: other, other: one}
         orders[name] = tuple(swap.get(tag, tag) for tag in orders[name])
@@ -153,7 +152,7 @@ def test_correct_orders_from_either_end_have_no_finding(right):
 
 
 def test_exchanged_labels_are_named_and_ranges_determine_the_order(right):
-    order = orders_of(FIVE, None)[0]["3"]
+    order = surveys.orders_of(FIVE, None)[0]["3"]
     pair = f"{min(order[:2])} and {max(order[:2])}"
     # Labels that are exchanged in all arrangements are one mistake.
     for wrong, text in (

@@ -9,9 +9,8 @@ import pytest
 
 import calib
 from benchmarks.trajectories import scenario
+from calib.estimator import range_rows, unknowns
 from calib.estimator import rows as sums
-from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows
-from calib.estimator.unknowns import Layout, Unknown
 from calib.settings import FlightSettings
 from calib.trajectories.motion import Distances, Motion, known_rows
 from calib.trajectories.scene import scene_from
@@ -182,7 +181,7 @@ def laid_out():
     )
     scene = scene_from(flown, FlightSettings(poses_until_s=1.0, anchors="sought", distances=tapes))
     motion = Motion.of(scene)
-    layout = Layout(motion.unknowns({}, 8.0))
+    layout = unknowns.Layout(motion.unknowns({}, 8.0))
     x = 3 * np.random.default_rng(2).normal(size=layout.size)
     # Rotations are linear to first order only: at 1e-4 rad to a ten-thousandth of a lever arm.
     x[layout.where["turn"]] *= 1e-4
@@ -192,14 +191,18 @@ def laid_out():
 def mixture_rows(scene, motion):
     """Return a layout of motion, delays of ten pairs and errors, and rows of a mixture with expected information."""
     levels = {"noise": -3.0, "odds": -2.0, "detour": -0.5, "least": -3.0, "outliers": -4.0, "long": -3.0}
-    blocks = [Unknown(kind=kind, names=("",), start=np.full(1, level)) for kind, level in levels.items()]
-    delays = Unknown(kind="delay", names=("",) * 10, start=np.linspace(-0.1, 0.1, 10))
-    layout = Layout((*motion.unknowns({}, 8.0), delays, *blocks))
+    blocks = [unknowns.Unknown(kind=kind, names=("",), start=np.full(1, level)) for kind, level in levels.items()]
+    delays = unknowns.Unknown(kind="delay", names=("",) * 10, start=np.linspace(-0.1, 0.1, 10))
+    layout = unknowns.Layout((*motion.unknowns({}, 8.0), delays, *blocks))
     key = np.arange(len(scene.time_s)) % 10
-    parts = [Part(parameter=kind, kind=kind, columns=np.zeros((len(key), 1), dtype=np.int64)) for kind in levels]
-    parts.append(Part(parameter=RESIDUAL, kind="delay", columns=key[:, None]))
+    parts = [
+        range_rows.Part(parameter=kind, kind=kind, columns=np.zeros((len(key), 1), dtype=np.int64)) for kind in levels
+    ]
+    parts.append(range_rows.Part(parameter=range_rows.RESIDUAL, kind="delay", columns=key[:, None]))
     geometry = Distances.of_ranges(motion, layout)
-    return layout, RangeRows.of(scene.ranges.raw_m, key, parts, Mixture(expected=True), layout, geometry)
+    return layout, range_rows.RangeRows.of(
+        scene.ranges.raw_m, key, parts, range_rows.Mixture(expected=True), layout, geometry
+    )
 
 
 @pytest.mark.parametrize("most", [0, 4000])
@@ -229,7 +232,7 @@ def test_sums_over_ranges_of_moving_bodies_are_those_of_all_rows_one_by_one(laid
         along[layout.where[kind]] = step[layout.where[kind]]
     vectors = [second - first for far in (1, 0, -1) for first, second, *_ in [rows.geometry.antennas(x + far * along)]]
     moved, distance = (vectors[0] - vectors[2]) / 2, np.linalg.norm(vectors[1], axis=1)
-    slope = rows.errors.slopes(rows.values(x))[1][RESIDUAL]
+    slope = rows.errors.slopes(rows.values(x))[1][range_rows.RESIDUAL]
     bends = np.abs(slope) / distance * np.sum(moved**2, axis=1)
     assert along @ (found.curvature - found.information) @ along == pytest.approx(bends.sum(), rel=1e-6)
 

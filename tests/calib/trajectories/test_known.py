@@ -17,8 +17,7 @@ from calib.trajectories.scene import scene_from
 from calib.trajectories.start import interpolated, resolve_headings
 from tests.calib.trajectories.sines import DELAYS_NS, flight, scores
 from tests.shared_data import miluv
-from uwblink import Arrangement, KnownDistance
-from uwblink.importers import read_source
+from uwblink import Arrangement, KnownDistance, importers
 
 pytestmark = pytest.mark.slow
 
@@ -180,7 +179,7 @@ def test_common_reflections_of_two_bodies_are_named(blocked):
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
-    return read_source(miluv(tmp_path_factory.mktemp("miluv")), importer="miluv")
+    return importers.read_source(miluv(tmp_path_factory.mktemp("miluv")), importer="miluv")
 
 
 def joint_scores(found, flown):
