@@ -3,12 +3,12 @@
 It follows docs/theory.md and the reference of the keys of a calibration, as an independent check.
 """
 
-import csv
 import json
 import re
 from html import unescape
 
 import numpy as np
+import pandas
 from scipy.interpolate import BSpline
 from scipy.optimize import brentq
 from scipy.stats import chi2, exponnorm, norm
@@ -41,13 +41,8 @@ def number(text):
 
 
 def columns(path):
-    """Return the exchanges of an exported table as columns."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    whole = ("time_ns", "initiator", "target", "tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
-    found = {name: np.array([row[name] for row in rows], dtype=np.int64) for name in whole}
-    numbers = ("truth_m", "fpp1_dbm", "fpp2_dbm")
-    return found | {name: np.array([float(row[name] or "nan") for row in rows]) for name in numbers}
+    """Return an exported table as columns."""
+    return {name: column.to_numpy() for name, column in pandas.read_csv(path).items()}
 
 
 def curve(table, lifted):
@@ -65,14 +60,13 @@ def beyond(table, lifted):
 
 
 class Corrected:
-    """Double-sided exchanges corrected by the JSON of a calibration, and their expected errors."""
+    """Double-sided exchanges in a file, corrected by the file of a calibration, and their expected errors."""
 
-    def __init__(self, table, known):
-        e = columns(table)
+    def __init__(self, table, calibration):
+        e, known = columns(table), json.loads(calibration.read_text())
         rows = np.isfinite(e["truth_m"])
         e = {name: column[rows] for name, column in e.items()}
-        self.first, self.second = e["initiator"], e["target"]
-        self.truth = e["truth_m"]
+        self.first, self.second, self.truth = e["initiator"], e["target"], e["truth_m"]
 
         def since(later, earlier):
             return ((e[later] - e[earlier]) % 2**32).astype(float)
@@ -92,11 +86,8 @@ class Corrected:
 
     def _errors(self, model):
         nodes, p_out, least = np.array(model["lifted"]), model["outlier_share"], model["least_m"]
-        names = [tuple(sorted(pair)) for pair in zip(self.first.tolist(), self.second.tolist(), strict=True)]
-        self.pair = np.array([f"{a}-{b}" for a, b in names])
-        shape = (len(self.pair),)
-        self.mean_error, self.total, self.tail_share = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-        self.low95, self.high95 = np.zeros(shape), np.zeros(shape)
+        self.pair = np.array([f"{a}-{b}" for a, b in np.sort([self.first, self.second], axis=0).T.tolist()])
+        self.mean_error, self.total, self.tail_share, self.low95, self.high95 = np.zeros((5, len(self.pair)))
         own = np.interp([0.025, 0.975], *np.array([[0.0, 0.0], *model["levels"], [1.0, 1.0]]).T)
         odds = np.log(np.array(model["tail_share"]) / (1 - np.array(model["tail_share"])))
         for name in np.unique(self.pair):
@@ -170,7 +161,3 @@ def stats(error):
         "high_m": np.percentile(error, 97.5),
         "abs95_m": np.percentile(np.abs(error), 95),
     }
-
-
-def corrected(table, calibration):
-    return Corrected(table, json.loads(calibration.read_text()))

@@ -28,24 +28,19 @@ def campaign(tmp_path_factory):
     """A training flight with passive listeners, a test flight, and the report of both as a page and as JSON."""
     folder = tmp_path_factory.mktemp("campaign")
     for name, seed in (("train", 1), (TEST, 2)):
-        settings = [f"run.seed={seed}", "run.duration_s=6", "tags.0.passive=true"]
-        options = [word for setting in settings for word in ("--set", setting)]
-        run(
-            "uwbsim",
-            "run",
-            shared_data.ROOT / "scenarios/icra2023/train.toml",
-            "-o",
-            f"{name}.uwb",
-            *options,
-            cwd=folder,
-        )
+        words = f"-o {name}.uwb --set run.seed={seed} --set run.duration_s=6 --set tags.0.passive=true"
+        run("uwbsim", "run", shared_data.ROOT / "scenarios/icra2023/train.toml", *words.split(), cwd=folder)
     words = f"report train.uwb --tests {TEST}.uwb -o r.html --json"
     (folder / "r.json").write_text(run("calib", *words.split(), cwd=folder).stdout)
     return folder
 
 
-def test_the_campaign_has_every_section_in_order(campaign):
-    page = (campaign / "r.html").read_text()
+@pytest.fixture(scope="module")
+def page(campaign):
+    return (campaign / "r.html").read_text()
+
+
+def test_the_campaign_has_every_section_in_order(campaign, page):
     sections = re.findall("<h2 id='s[0-9]+'>(.*?)</h2>", page)
     assert sections == [
         "What was recorded", "Are the delays determined?", "Antenna delays", "Bias and standard deviation over power",
@@ -64,8 +59,7 @@ def test_the_campaign_has_every_section_in_order(campaign):
         assert page.count(hashlib.sha256((campaign / name).read_bytes()).hexdigest()) == 1
 
 
-def test_all_figures_have_paper_size(campaign):
-    page = (campaign / "r.html").read_text()
+def test_all_figures_have_paper_size(page):
     drawings = re.findall("<svg.*?</svg>", page, re.DOTALL)
     assert len(drawings) == 2 * page.count("<figure>")
     for drawing in drawings:
@@ -83,16 +77,15 @@ def test_the_json_contains_the_results_of_the_page(campaign):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 390])
-def test_a_browser_shows_the_report(campaign, tmp_path, width):
+def test_a_browser_shows_the_report(campaign, page, tmp_path, width):
     picture = tmp_path / "page.png"
     words = (f"--window-size={width},2400", f"--screenshot={picture}", (campaign / "r.html").as_uri())
     browser.chromium(*words, profile=tmp_path / "profile")
-    browser.lies_well((campaign / "r.html").read_text(), width, tmp_path)
+    browser.lies_well(page, width, tmp_path)
     pixels = imread(picture)
     assert pixels.shape[:2] == (2400, width)
     # Text and figures from top to bottom: no band of the page is blank.
-    bands = np.array_split(pixels[..., :3].std(axis=(1, 2)), 8)
-    assert all(band.max() > 0.05 for band in bands)
+    assert all(band.max() > 0.05 for band in np.array_split(pixels[..., :3].std(axis=(1, 2)), 8))
 
 
 def test_tests_take_several_files():
@@ -101,8 +94,8 @@ def test_tests_take_several_files():
     assert spread_tests(["fit", "a", "-o", "c"]) == ["fit", "a", "-o", "c"]
 
 
-def test_planted_delays_are_shown_beside_fitted_ones(campaign):
-    header, *rows = page_of_numpy.Tables((campaign / "r.html").read_text()).having("planted, same gauge (ns)")
+def test_planted_delays_are_shown_beside_fitted_ones(campaign, page):
+    header, *rows = page_of_numpy.Tables(page).having("planted, same gauge (ns)")
     given = load(campaign / "train.uwb").meta["planted"]["delays_ns"]
     fitted, known, difference_ps = np.array([[page_of_numpy.number(row[k]) for k in (1, 4, 5)] for row in rows]).T
     planted = np.array([given[row[0]] for row in rows])
@@ -116,14 +109,13 @@ def test_planted_delays_are_shown_beside_fitted_ones(campaign):
 
 
 @pytest.mark.slow
-def test_a_campaign_s_tables_have_the_numbers_of_its_test(campaign):
+def test_a_campaign_s_tables_have_the_numbers_of_its_test(campaign, page):
     """Shares beyond three sigma by side, and the gains of filters, whose signs must be those of the page."""
     run("calib", "fit", "train.uwb", "-o", "same.json", cwd=campaign)
     run("uwblink", "export", f"{TEST}.uwb", "--to", "csv", "-o", "csv", cwd=campaign)
-    page = page_of_numpy.corrected(campaign / "csv" / "exchanges.csv", campaign / "same.json")
-    tables = page_of_numpy.Tables((campaign / "r.html").read_text())
-    z = (page.full - page.truth) / page.sigma
-    for name, rows in page.groups().items():
+    own = page_of_numpy.Corrected(campaign / "csv" / "exchanges.csv", campaign / "same.json")
+    tables, z = page_of_numpy.Tables(page), (own.full - own.truth) / own.sigma
+    for name, rows in own.groups().items():
         told = [page_of_numpy.number(cell) for cell in tables.row(name, "too long")[1:3]]
         assert told == pytest.approx([100 * np.mean(z[rows] > 3), 100 * np.mean(z[rows] < -3)], abs=0.051)
     assert np.mean(z > 3) > np.mean(z < -3)
@@ -134,8 +126,7 @@ def test_a_campaign_s_tables_have_the_numbers_of_its_test(campaign):
     )
     assert mean == pytest.approx(np.mean(tracked, axis=0), abs=1.1e-3)
     assert against == pytest.approx(100 * (mean[1:] / mean[0] - 1), abs=1.0)
-    text = re.sub(r"<[^>]*>", "", (campaign / "r.html").read_text())
-    said = re.search(r"the mean NIS is .*? pass the gate", text, re.DOTALL)[0]
+    said = re.search(r"the mean NIS is .*? pass the gate", re.sub(r"<[^>]*>", "", page), re.DOTALL)[0]
     nis, one, _, low, high, _, nees, three, nees_low, nees_high, *_ = map(float, re.findall(r"\d+(?:\.\d+)?", said))
     # Bounds of a mean square are about its expectation: one of a range, three of a position.
     assert (one, three) == (1, 3)
