@@ -72,6 +72,12 @@ def about_their_mean(known: Calibration, planted: dict[int, float]):
     return error, np.sqrt(np.diag(centre @ known.covariance_ns2(list(planted)) @ centre))
 
 
+def largest_score(result, planted: dict[int, float]):
+    """Return the largest error of a delay of a fit divided by its stated standard error, given planted delays in ns."""
+    found = result.calibration
+    return max(abs(delay - planted[tag]) / found.delays_std_ns[tag] for tag, delay in found.delays_ns.items())
+
+
 def track_errors(track, after_s=0.0):
     """Return distances (n,) in metres between estimated and true positions from some seconds after the start on."""
     late = track.time_ns >= track.time_ns[0] + int(after_s * 1e9)

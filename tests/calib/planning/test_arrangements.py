@@ -12,8 +12,6 @@ from benchmarks import standing, surveys
 from calib.planning.surveys import PLANNED_CURVE_STD_M, POWER_AT_1_M_DBM, delay_information, predict
 from tests.processes import succeed
 
-C_M_PER_NS = 0.299702547
-
 
 def given(boards, on="line", **settings):
     return calib.SurveyPlanSettings(tags=tuple(range(1, boards + 1)), on=on, **settings)
@@ -26,7 +24,7 @@ def in_orders(*orders):
 
 def information(inputs, one):
     """Return the information on the delays, in units of a pair's error."""
-    return delay_information(inputs, one)[0] * (0.02 / C_M_PER_NS) ** 2
+    return delay_information(inputs, one)[0] * (0.02 / standing.C_M_PER_NS) ** 2
 
 
 def test_the_information_of_boards_in_a_row_agrees_with_counting():
@@ -52,7 +50,7 @@ def test_plans_agree_with_counting(boards, on, count, each, common):
     """Random arrangements: 0.76 and 0.38 on a line, 0.78 and 0.30 in a plane; chosen ones are slightly better."""
     found = calib.plan(boards, on=on, arrangements=count)
     # Intervals include Student's factor of the degrees of freedom, about 1.05.
-    unit = 1.96 * found.pair_error_m / C_M_PER_NS * 1.05
+    unit = 1.96 * found.pair_error_m / standing.C_M_PER_NS * 1.05
     assert np.sqrt(np.mean(np.square(list(found.half_ns.values())))) / unit == pytest.approx(each, rel=0.08)
     assert found.common_ns / unit == pytest.approx(common, rel=0.1)
     # The default number of arrangements stops at small gains.
@@ -76,17 +74,16 @@ def test_delays_are_undetermined_without_known_facts(boards, settings, undetermi
 
 def test_one_arrangement_of_eight_in_space_determines_no_delay():
     found = calib.plan(8, on="space", arrangements=1)
-    assert len(found.undetermined) >= 7
-    assert found.next_best[0].what.startswith("an arrangement with 1 at (")
-    assert found.next_best[0].mean_ns < found.next_best[0].instead_of_ns
+    best = found.next_best[0]
+    assert (len(found.undetermined) >= 7, best.what[:26]) == (True, "an arrangement with 1 at (")
+    assert best.mean_ns < best.instead_of_ns
 
 
 def test_the_gain_of_a_measured_distance_is_as_predicted():
     without, with_it = (calib.plan(5, on="plane", arrangements=3, taped=taped) for taped in (0, 1))
     tape = next(best for best in without.next_best if "a measured distance" in best.what)
     mean = math.sqrt(np.mean(np.square(list(with_it.half_ns.values()))))
-    assert mean == pytest.approx(tape.mean_ns, rel=0.05)
-    assert mean < tape.instead_of_ns
+    assert pytest.approx(tape.mean_ns, rel=0.05) == mean < tape.instead_of_ns
     # It has the weight of its own sigma.
     common = [
         calib.plan(3, arrangements=2, taped=2, tape_sigma_m=sigma, pair_error_m=0.02).common_ns
@@ -99,8 +96,8 @@ def test_plans_agree_with_surveys():
     plan = calib.plan(4, on="line", arrangements=7)
     places = [np.array([a.place_m[t] for t in plan.tags]) for a in plan.arrangements]
     result = calib.survey(standing.standing_boards(3, places=places).ranges, known="line", pair_error_m=0.02)
-    found = np.array([1.96 * result.calibration.delays_std_ns[t] for t in plan.tags])
-    assert found == pytest.approx(np.array([plan.half_ns[t] for t in plan.tags]), rel=0.1)
+    found = {tag: 1.96 * std for tag, std in result.calibration.delays_std_ns.items()}
+    assert found == pytest.approx(dict(plan.half_ns), rel=0.1)
 
 
 def test_the_command_prints_steps_and_json():
@@ -118,35 +115,10 @@ def test_the_command_prints_steps_and_json():
     assert (sorted(told["half_interval_ns"]), len(told["undetermined"])) == (["1", "2", "5"], 2)
 
 
-@pytest.mark.parametrize(
-    ("boards", "settings", "message"),
-    [
-        (1, {}, "boards"),
-        *((wrong, {}, "boards") for wrong in ([1, 1], [-1, 2], [1, 70000], [1.5, 2], "abc", 3.5)),
-        *((4, {"seed": wrong}, "seed") for wrong in (-1, 1.5)),
-        (4, {"on": "ring"}, "on"),
-        (4, {"arrangements": 0}, "arrangements"),
-        *((4, {"size_m": wrong}, "size_m") for wrong in ((1.0, 2.0), 3.0)),
-        (4, {"taped": -1}, "taped"),
-        (4, {"tape_sigma_m": 0.0}, "tape_sigma_m"),
-        (4, {"pair_error_m": math.nan}, "pair_error_m"),
-        (4, {"reflected": 0.4}, "reflected"),
-        (4, {"on": "plane", "anchors": [9]}, "anchors"),
-        (4, {"on": "line", "anchors": [1]}, "anchors"),
-        (4, {"on": "plane", "anchors": [1, 2, 1]}, "anchors"),
-        (4, {"rate_hz": 0.0}, "rate_hz"),
-        (30, {"on": "plane", "size_m": (0.5, 0.5)}, "there is no room"),
-    ],
-)
-def test_what_cannot_be_planned_is_refused(boards, settings, message):
-    with pytest.raises(ValueError, match=message):
-        calib.plan(boards, **settings)
-
-
 def test_three_boards_in_a_row_are_not_used_if_a_pair_is_mostly_reflected():
     """All three pairs are direct with 0.9^3 = 0.73 and 0.7^3 = 0.34; then the middle delay is determined as usual."""
     row = in_orders((1, 2, 3))
-    assert predict(given(3, reflected=0.1), row)[0].each[1] == pytest.approx(0.02 * math.sqrt(3) / C_M_PER_NS)
+    assert predict(given(3, reflected=0.1), row)[0].each[1] == pytest.approx(0.02 * math.sqrt(3) / standing.C_M_PER_NS)
     assert np.isinf(predict(given(3, reflected=0.3), row)[0].each[1])
 
 
@@ -162,15 +134,14 @@ def test_reflected_pairs_cost_the_information_of_missing_pairs():
             apart = place[pairs[:, 0], :2] - place[pairs[:, 1], :2]
             apart /= np.linalg.norm(apart, axis=1, keepdims=True)
             seen = rng.uniform(size=len(pairs)) >= 0.1
-            wanted, others = -0.5 * (first + second)[seen], np.einsum("pb,pd->pbd", first - second, apart)[seen]
-            others = others.reshape(len(wanted), -1)
-            left = wanted - others @ np.linalg.pinv(others) @ wanted
+            others = np.einsum("pb,pd->pbd", first - second, apart)[seen].reshape(seen.sum(), -1)
+            left = (np.eye(seen.sum()) - others @ np.linalg.pinv(others)) @ (-0.5 * (first + second)[seen])
             total += left.T @ left / 0.02**2
         of_draws.append(np.diag(np.linalg.pinv(total)))
     found, plain = (
         predict(given(6, "plane", reflected=share), surveys.planned(places))[-1].each for share in (0.1, 0.0)
     )
-    assert np.sqrt(np.mean(found**2)) == pytest.approx(np.sqrt(np.mean(of_draws)) / C_M_PER_NS, rel=0.15)
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(np.sqrt(np.mean(of_draws)) / standing.C_M_PER_NS, rel=0.15)
     assert np.mean(found) > 1.05 * np.mean(plain)
 
 
@@ -186,9 +157,8 @@ def test_a_curve_costs_the_information_of_a_process_of_its_size(monkeypatch):
 def test_a_plan_states_the_accuracy_lost_by_reflections_and_a_curve():
     plain, reflected = (calib.plan(4, on="line", arrangements=4, reflected=share) for share in (0.0, 0.1))
     assert "and 10 % of the pairs are reflected:" in str(reflected)
-    assert max(reflected.half_ns.values()) > max(plain.half_ns.values())
     curved = plain.with_curve_ns
-    assert curved.each > max(plain.half_ns.values())
+    assert min(curved.each, max(reflected.half_ns.values())) > max(plain.half_ns.values())
     assert curved.each == pytest.approx(math.hypot(curved.apart, curved.common), rel=1e-6)
     assert f"common part ± {curved.common:.3f} ns." in str(plain)
     assert reflected.to_dict()["with_curve_ns"]["common"] > plain.to_dict()["with_curve_ns"]["common"]

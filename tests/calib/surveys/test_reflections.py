@@ -14,6 +14,7 @@ from calib.surveys.recordings import read_surveys
 from calib.surveys.reflections import Marks
 from calib.surveys.solution import exchanged_boards, first_start, is_in_order
 from calib.surveys.survey import network_of
+from tests.calib.synthetic import largest_score
 
 pytestmark = pytest.mark.slow
 
@@ -26,22 +27,17 @@ def linear():
     world = standing.standing_boards(11, boards=4, arrangements=3, reflected=0.12)
     knowledge = calib.Knowledge(shape="line")
     network = network_of(read_surveys(world.ranges, knowledge), knowledge, {}, curve=False)
-    x, free = first_start(network), network.layout.free()
-    rows = len(network.means.range_m)
+    x, free, rows = first_start(network), network.layout.free(), len(network.means.range_m)
     left, jacobian = network.linear(x)
-    prior, centre = network.priors(CURVE_M).precision(), network.layout.start()
-    spread = jacobian[:, free] @ np.linalg.inv(prior[np.ix_(free, free)]) @ jacobian[:, free].T
-    seen = left + jacobian[:, free] @ (x - centre)[free]
+    prior, slopes = network.priors(CURVE_M).precision()[np.ix_(free, free)], jacobian[:, free]
+    spread, seen = slopes @ np.linalg.inv(prior) @ slopes.T, left + slopes @ (x - network.layout.start())[free]
 
-    def deviance(marks):
-        marks = np.array(marks, dtype=float)
-        own = network.means.std_m**2 + PAIR_M**2 + 0.25**2 * marks
-        count = marks.sum()
+    def deviance(hit):
+        own, count = network.means.std_m**2 + PAIR_M**2 + 0.25**2 * hit, hit.sum()
         share = betaln(1 + count, 30 + rows - count) - betaln(1, 30)
-        covariance, away = np.diag(own) + spread, seen - 0.3 * marks
+        covariance, away = np.diag(own) + spread, seen - 0.3 * hit
         back = np.linalg.inv(covariance)
         # No detour is shorter than the direct path, except for a gross error in a hundred.
-        hit = marks > 0
         detour, std = 0.3 + 0.25**2 * (back @ away)[hit], np.sqrt(0.25**2 - 0.25**4 * np.diag(back)[hit])
         longer = np.log((ndtr(detour / std) + 0.01) / (ndtr(0.3 / 0.25) + 0.01)).sum()
         return np.linalg.slogdet(covariance)[1] + away @ np.linalg.solve(covariance, away) - 2 * share - 2 * longer
@@ -88,14 +84,13 @@ def test_planted_reflections_are_named_and_delays_are_as_good_as_without():
     )
     assert result.contradictions == ()
     assert [one.fault for one in result.findings].count("reflections of a pair") >= len(planted)
-    assert not any(one.chance > 0.5 for one in clean.reflected)
+    assert max((one.chance for one in clean.reflected), default=0) <= 0.5
     for tag, delay in world.delays_ns.items():
         (found, std), (other, other_std) = (
             (one.calibration.delays_ns[tag], one.calibration.delays_std_ns[tag]) for one in (result, clean)
         )
-        assert abs(found - delay) < 3 * std
         # 5 of 70 rows have no weight: intervals are slightly wider, and errors equal.
-        assert std < 1.5 * other_std
+        assert abs(found - delay) / 3 < std < 1.5 * other_std
         assert abs(found - other) < 0.08
     assert len(result.calibration.provenance["reflected"]) == len(result.reflected)
 
@@ -105,8 +100,7 @@ def test_reflections_do_not_shorten_ranges():
     world = standing.standing_boards(1034, boards=5, arrangements=8, reflected=0.1)
     found = calib.survey(world.ranges, known="line")
     assert all(one.longer_m > -0.1 for one in found.reflected)
-    for tag, delay in world.delays_ns.items():
-        assert abs(found.calibration.delays_ns[tag] - delay) < 3 * found.calibration.delays_std_ns[tag]
+    assert largest_score(found, world.delays_ns) < 3
 
 
 def test_ambiguous_reflections_are_stated_and_widen_intervals():
@@ -118,8 +112,8 @@ def test_ambiguous_reflections_are_stated_and_widen_intervals():
     assert any(text.startswith("may also be reflected: ") for text in result.warnings)
     clean = calib.survey(world.ranges, known="line").calibration
     for tag, delay in result.calibration.delays_ns.items():
-        assert abs(delay - world.delays_ns[tag]) < 3 * result.calibration.delays_std_ns[tag]
-        assert result.calibration.delays_std_ns[tag] > clean.delays_std_ns[tag]
+        least = max(abs(delay - world.delays_ns[tag]) / 3, clean.delays_std_ns[tag])
+        assert result.calibration.delays_std_ns[tag] > least
 
 
 # Stated orders of boards: exchanged labels are named, correct ones are not, and ambiguous ones are stated.
@@ -146,8 +140,8 @@ def right():
 def test_correct_orders_from_either_end_have_no_finding(right):
     known = said_with(FIVE)
     turned = replace(known, orders={name: order[::-1] for name, order in known.orders.items()})
-    assert right.contradictions == ()
     found = calib.survey(FIVE.ranges, known=turned)
+    assert right.contradictions == found.contradictions == ()
     assert found.calibration.delays_ns == pytest.approx(right.calibration.delays_ns, abs=1e-3)
 
 

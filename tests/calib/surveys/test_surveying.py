@@ -22,18 +22,14 @@ from calib.cli.commands import app
 from calib.data.samples import ANCHOR_DELAYS_NS, stamped
 from calib.surveys.knowledge import load_knowledge
 from tests import processes
+from tests.calib.synthetic import largest_score
 from uwblink.recording.schema import KnownDistance, load_places
 
 
 def in_order(*orders):
     """Return positions on a line (boards, 3) in a given order of boards, with uneven steps."""
-    steps = np.array([0.0, 0.9, 2.1, 3.6])
-    found = []
-    for order in orders:
-        place = np.zeros((len(order), 3))
-        place[np.array(order) - 1, 0] = steps[: len(order)]
-        found.append(place)
-    return found
+    steps = np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [2.1, 0.0, 0.0], [3.6, 0.0, 0.0]])
+    return [steps[np.argsort(order)] for order in orders]
 
 
 FOUR = in_order((1, 2, 3, 4), (2, 1, 4, 3), (3, 1, 4, 2), (2, 4, 1, 3), (4, 3, 2, 1), (1, 3, 4, 2), (3, 2, 4, 1))
@@ -54,9 +50,9 @@ def moved(by_m, arrangements, **settings):
 
 
 def crooked():
-    places = [p.copy() for p in FOUR[:5]]
-    places[2][3, 1] = 1.2
-    return standing_boards(9, places=places, pair_error_m=0.01, bias_size_m=0.02)
+    off = np.zeros((5, 4, 3))
+    off[2, 3, 1] = 1.2
+    return standing_boards(9, places=[*np.array(FOUR[:5]) + off], pair_error_m=0.01, bias_size_m=0.02)
 
 
 def saved(world, path, known="line", distances=(), power_dbm=None):
@@ -67,12 +63,6 @@ def saved(world, path, known="line", distances=(), power_dbm=None):
     marks = [uwblink.Arrangement("ABCDEFGH"[k], ns, ns + 65 * 10**9, known) for k, ns in enumerate(at_ns.tolist())]
     uwblink.Contents(exchanges=x, arrangements=marks, known_distances=list(distances)).save(path)
     return path
-
-
-def largest_score(result, planted):
-    """Return the largest error of a delay, divided by its stated standard error."""
-    found = result.calibration
-    return max(abs(d - planted[t]) / found.delays_std_ns[t] for t, d in found.delays_ns.items())
 
 
 def test_without_noise_delays_and_places_are_exact():
@@ -155,11 +145,11 @@ def test_a_curve_over_power_is_found_along_with_the_delays():
     world = standing_boards(2, "plane", boards=5, arrangements=6, bias_size_m=0.06, size_m=9.0, pair_error_m=0.01)
     result = calib.survey(world.ranges, known="plane")
     curve = result.calibration.bias_curve
-    assert float(curve(np.array([1.0]))[0]) == pytest.approx(0.0, abs=2e-3)
+    reference, low, high = curve(np.array([1.0, *curve.range]))
+    assert reference == pytest.approx(0.0, abs=2e-3)
     assert largest_score(result, world.delays_ns) < 3.5
     # -77 dBm at a metre: from 0.4 m (-69) to 9 m (-96), the planted curve increases by 11 cm.
-    low, high = curve.range
-    assert float(curve(np.array([low]))[0] - curve(np.array([high]))[0]) > 0.05
+    assert low - high > 0.05
 
 
 @pytest.mark.slow
@@ -171,8 +161,8 @@ def test_the_common_delay_is_within_its_interval_for_non_monotonic_curves():
     off = np.mean([found.delays_ns[tag] - planted for tag, planted in world.delays_ns.items()])
     assert abs(off) < 2 * math.sqrt(np.mean(found.uncertainty.delays_ns2)) < 0.2
     # Planted: 7.6 cm between these two powers.
-    fall = found.bias_curve(10 ** ((np.array([-86.0, -82.0]) + 82.0) / 10))
-    assert float(fall[0] - fall[1]) == pytest.approx(0.076, abs=0.045)
+    rise = np.diff(found.bias_curve(10 ** ((np.array([-82.0, -86.0]) + 82.0) / 10)))
+    assert rise == pytest.approx(0.076, abs=0.045)
 
 
 def test_spans_and_shape_of_a_file_make_arrangements(tmp_path):
@@ -236,13 +226,11 @@ def test_a_position_for_all_arrangements_is_one_measurement():
 def test_errors_that_last_within_an_arrangement_widen_intervals():
     r = standing_boards(5, places=FOUR[:4], pair_error_m=0.0).ranges
     slow, quick = 2 * np.pi * r.time_ns / 20e9 + r.initiator * r.target, np.arange(len(r)) * 2.4
-    stds = [
-        calib.survey(
-            replace(r, raw_m=r.raw_m + 0.06 * np.sin(phase)), known="line", pair_error_m=1e-4
-        ).calibration.delays_std_ns[2]
+    lasting, brief = (
+        calib.survey(replace(r, raw_m=r.raw_m + 0.06 * np.sin(phase)), known="line", pair_error_m=1e-4).calibration
         for phase in (slow, quick)
-    ]
-    assert stds[0] > 1.5 * stds[1]
+    )
+    assert lasting.delays_std_ns[2] > 1.5 * brief.delays_std_ns[2]
 
 
 def test_few_arrangements_widen_intervals_by_students_quantile():
@@ -250,8 +238,8 @@ def test_few_arrangements_widen_intervals_by_students_quantile():
     # The prior of the pair error counts as three degrees of freedom (docs/theory.md).
     wider = student.ppf(0.975, result.calibration.provenance["geometry"]["freedom"] + 3) / norm.ppf(0.975)
     assert wider > 1.05
-    found = [result.calibration.delays_std_ns[t] for t in sorted(result.calibration.delays_ns)]
-    assert found == pytest.approx(result.verdict.std[result.verdict.determined] * wider, rel=1e-6)
+    expected = result.verdict.std[result.verdict.determined] * wider
+    assert [*result.calibration.delays_std_ns.values()] == pytest.approx(expected, rel=1e-6)
 
 
 def test_known_positions_give_the_frame():
@@ -264,7 +252,7 @@ def test_known_positions_give_the_frame():
     assert one.frame == "that of the known positions"
     for board, corner in zip(one.boards, corners, strict=True):
         std = math.sqrt(np.diag(board.covariance_m2).max())
-        assert np.abs(np.array(board.position_m) - corner).max() < 4 * std
+        assert board.position_m == pytest.approx(corner, abs=4 * std)
 
 
 @pytest.mark.parametrize(("by_m", "chance"), [(0.10, 1e-6), (-0.25, 1e-50)])
@@ -338,9 +326,9 @@ def test_powers_that_hardly_vary_are_named_by_the_doctor(tmp_path):
 
 def test_a_known_delay_stays_and_the_others_follow():
     world = standing_boards(5, boards=3, places=in_order((1, 2, 3), (2, 1, 3)), pair_error_m=0.005)
-    result = calib.survey(world.ranges, known="line", fixed_ns={3: world.delays_ns[3]})
-    assert result.calibration.delays_ns[3] == pytest.approx(world.delays_ns[3], abs=1e-3)
-    assert (result.calibration.delays_std_ns[3], set(result.calibration.delays_ns)) == (0.0, {1, 2, 3})
+    found = calib.survey(world.ranges, known="line", fixed_ns={3: world.delays_ns[3]}).calibration
+    assert found.delays_ns[3] == pytest.approx(world.delays_ns[3], abs=1e-3)
+    assert (found.delays_std_ns[3], set(found.delays_ns)) == (0.0, {1, 2, 3})
 
 
 @pytest.mark.parametrize(
@@ -443,12 +431,11 @@ def test_the_command_accepts_a_recording_per_arrangement(recording, tmp_path):
 
 def test_positions_are_written_for_ros_and_as_a_figure(surveyed, tmp_path):
     surveyed.save_anchors(tmp_path / "a.yaml", arrangement="A")
-    text = (tmp_path / "a.yaml").read_text()
-    assert "ids: [1, 2, 3, 4]" in text
-    assert text.count("covariance: [") == 4
     surveyed.save_picture(tmp_path / "places.svg")
+    text, drawn = ((tmp_path / name).read_text() for name in ("a.yaml", "places.svg"))
     # One panel each.
-    assert (tmp_path / "places.svg").read_text().count('id="axes_') == 4
+    found = text.count("ids: [1, 2, 3, 4]"), text.count("covariance: ["), drawn.count('id="axes_')
+    assert found == (1, 4, 4)
 
 
 @pytest.mark.parametrize(
@@ -510,8 +497,8 @@ def test_a_curve_is_used_if_powers_do_not_vary():
     result = calib.survey(world.ranges, known=taped, curve_from=known)
     found = result.calibration
     assert found.bias_curve == known.bias_curve
-    off = [np.mean([c.delays_ns[t] - delay for t, delay in world.delays_ns.items()]) for c in (alone, found)]
-    assert abs(off[1]) < 0.5 * abs(off[0])
+    without, off = (np.mean([c.delays_ns[t] - d for t, d in world.delays_ns.items()]) for c in (alone, found))
+    assert abs(off) < 0.5 * abs(without)
     assert largest_score(result, world.delays_ns) < 3.5
     # Intervals include the errors of the curve.
     sure = calib.survey(world.ranges, known=taped, curve_from=replace(known, uncertainty=None)).calibration

@@ -14,6 +14,10 @@ ARM = 0.24
 MAST = np.array([0.3, -0.1, 0.2])
 """Lever arm of an anchor's antenna."""
 
+CORNERS = [[3.5, 3.5, 0.3], [-3.5, 3.5, 2.6], [-3.5, -3.5, 0.5], [3.5, -3.5, 2.5]]
+CEILING = [[3.5, 3.5, 2.6], [-3.5, 3.5, 2.6], [-3.5, -3.5, 2.6], [3.5, -3.5, 2.6]]
+"""Places of antennas of anchors: low and high, and all in a plane."""
+
 REPLY = 20_000_000
 PAIRS = np.array([(1, 3), (2, 5), (4, 6), (1, 4), (2, 6), (3, 5), (1, 5), (2, 3), (4, 5), (1, 6), (2, 4), (3, 6)])
 
@@ -43,13 +47,13 @@ def heading(body, t):
     return body + 1.2 * np.sin(2 * np.pi * t / (13.0 + 2 * body))
 
 
-def turn(angle, vector):
-    """Rotate a vector (3,) about the vertical by angles (n,)."""
-    return Rotation.from_euler("z", angle[:, None]).apply(vector)
-
-
 def arm(tag, length_m=ARM):
     return np.array([1.0, -1.0, -0.2]) * length_m * (1 if tag % 2 else -1)
+
+
+def distance_errors(result, flown):
+    """Return errors of the estimated distances (n,) of a flight, in metres."""
+    return result.ranges.truth_m - flown.distance_m[np.searchsorted(flown.exchanges.time_ns, result.ranges.time_ns)]
 
 
 def scores(result):
@@ -69,11 +73,6 @@ class Flight:
     imu: dict[str, Any] = field(default_factory=dict)
     height: dict[str, Any] = field(default_factory=dict)
     antennas: Any = None
-
-
-def turned_anchor(tag):
-    """Return the attitude of an anchor: rotated about all axes, differently for each."""
-    return Rotation.from_euler("ZYX", [1.1 * tag, 0.4, -0.3])
 
 
 def bias(lifted):
@@ -117,23 +116,21 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
         rows = np.arange(n) % 3 > 0
         pair[rows, 0] = 11 + np.arange(rows.sum()) % len(stand)
         pair[rows, 1] = 1 + (np.arange(rows.sum()) * 5 // 3) % 6
-    delay = np.zeros(12 + len(stand))
-    for tag, value in DELAYS_NS.items():
-        delay[tag] = value
-    for k, tag in enumerate(stand):
-        delay[tag] = 0.1 * (-1) ** k
+    planted = DELAYS_NS | {tag: 0.1 * (-1) ** k for k, tag in enumerate(stand)}
+    delay = np.array([planted.get(tag, 0.0) for tag in range(12 + len(stand))])
 
     def antenna(ids, seconds):
         found = np.zeros((len(ids), 3))
         for tag in np.unique(ids):
             rows = ids == tag
             body, when = (tag - 1) // 2, since_takeoff(seconds[rows], standing_s)
-            here = (
-                np.broadcast_to(stand[tag], (rows.sum(), 3))
+            found[rows] = (
+                stand[tag]
                 if tag in stand
-                else (place(body, when) + turn(heading(body, when), arm(tag, arm_m)) + shake(body, when, *shaken))
+                else place(body, when)
+                + Rotation.from_euler("z", heading(body, when)[:, None]).apply(arm(tag, arm_m))
+                + shake(body, when, *shaken)
             )
-            found[rows] = here
         return found
 
     distance = np.linalg.norm(antenna(pair[:, 0], t) - antenna(pair[:, 1], t), axis=1)
@@ -174,14 +171,15 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
         seen = place(body, flown_s) + shake(body, flown_s, *shaken) + place_noise_m * rng.normal(size=(len(when), 3))
         poses_of.append((when, np.full(len(when), f"robot{body}"), seen, turned.as_quat()))
     for tag, here in stand.items():
-        turned = turned_anchor(tag)
+        # Anchors are rotated about all axes, differently for each.
+        turned = Rotation.from_euler("ZYX", [1.1 * tag, 0.4, -0.3])
         two = (np.tile(each, (2, 1)) for each in (here - turned.apply(MAST), turned.as_quat()))
         poses_of.append((np.array([0.0, seconds]), np.full(2, f"anchor{tag}"), *two))
     times, names, places, attitudes = map(np.concatenate, zip(*poses_of, strict=True))
     poses_time_ns = np.rint(times * 1e9).astype(np.int64)
     poses = Poses.from_arrays(poses_time_ns, names, places, attitudes)
-    planted = {str(tag): float(delay[tag]) for tag in [*DELAYS_NS, *stand]}
-    flown = Flight(exchanges, poses, tags, distance, {"delays_ns": planted}, antennas=antenna)
+    of_tags = {"delays_ns": {str(tag): value for tag, value in planted.items()}}
+    flown = Flight(exchanges, poses, tags, distance, of_tags, antennas=antenna)
     if height_off_m is not None:
         # 50 readings per second of each body.
         robots = slice(0, 3 * len(when))

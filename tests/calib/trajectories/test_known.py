@@ -15,14 +15,14 @@ import uwbsim
 from calib.trajectories.samples import tapes_of
 from calib.trajectories.scene import scene_from
 from calib.trajectories.start import interpolated, resolve_headings
-from tests.calib.trajectories.sines import DELAYS_NS, flight, scores
+from tests.calib.synthetic import largest_score
+from tests.calib.trajectories.sines import CEILING, CORNERS, DELAYS_NS, distance_errors, flight, scores
 from tests.shared_data import miluv
 from uwblink import Arrangement, KnownDistance, importers
 
 pytestmark = pytest.mark.slow
 
-CEILING = [[3.5, 3.5, 2.6], [-3.5, 3.5, 2.6], [-3.5, -3.5, 2.6], [3.5, -3.5, 2.6]]
-CORNERS = [[3.5, 3.5, 0.3], [-3.5, 3.5, 2.6], [-3.5, -3.5, 0.5], [3.5, -3.5, 2.5]]
+
 KNOWN_START: dict[str, Any] = {"poses_until_s": 6.0, "heading_std_deg": 0.0}
 
 
@@ -31,12 +31,6 @@ def common(result):
     found, planted = result.calibration, [*DELAYS_NS.values()]
     error = np.mean([found.delays_ns[tag] for tag in DELAYS_NS]) - np.mean(planted)
     return float(error), float(np.sqrt(np.mean(found.uncertainty.delays_ns2)))
-
-
-def largest_score(result, planted=DELAYS_NS):
-    """Return the largest error of a delay divided by its stated standard error."""
-    found = result.calibration
-    return max(abs(found.delays_ns[int(tag)] - delay) / found.delays_std_ns[int(tag)] for tag, delay in planted.items())
 
 
 def by_tape(flown, first, second, off_m=0.0, std_m=0.005):
@@ -57,10 +51,8 @@ def test_a_measured_distance_determines_the_common_delay():
     result = calib.fit_from_ranges(flown, distances=[by_tape(flown, 1, 3)], **given)
     error, std = common(result)
     # 26 ranges of the pair while both stood still, with 4 cm each and some reflected, leave 0.1 ns of both delays.
-    assert std < 0.15
-    assert abs(error) < 3 * std
-    truth = flown.distance_m[np.searchsorted(flown.exchanges.time_ns, result.ranges.time_ns)]
-    assert abs(np.mean(result.ranges.truth_m - truth)) < 0.05
+    assert abs(error) / 3 < std < 0.15
+    assert abs(np.mean(distance_errors(result, flown))) < 0.05
     assert result.calibration.provenance["geometry"]["distances"] == 1
 
 
@@ -86,8 +78,7 @@ def test_the_weight_of_a_distance_is_independent_of_its_duration():
         KnownDistance(2, 3, 2.0, 0.02, "5..5.9"),
     ]
     found = tapes_of(stated, [floor], bodies, {"c", "d"}, 0, 20.0)
-    expected = [np.nan, 1.2, 1.6, 2.0, 2.4, 2.8, 5.225, 5.675]
-    assert found.time_s == pytest.approx(expected, nan_ok=True)
+    assert found.time_s == pytest.approx([np.nan, 1.2, 1.6, 2.0, 2.4, 2.8, 5.225, 5.675], nan_ok=True)
     assert found.number.tolist() == [0, *[1] * 5, *[2] * 2]
     weights = np.bincount(found.number, found.std_m**-2.0)
     assert weights == pytest.approx([one.sigma_m**-2.0 for one in stated])
@@ -128,8 +119,8 @@ def test_heights_resolve_the_mirror_image_of_anchors_in_a_plane():
     read[::97] = np.nan
     result = calib.fit_from_ranges(flown, **given)
     assert ["a second solution" in " ".join(one.warnings) for one in (without, result)] == [True, False]
-    assert common(result)[1] < 0.75 * common(without)[1]
-    assert abs(common(result)[0]) < 3 * common(result)[1]
+    error, std = common(result)
+    assert abs(error) / 3 < std < 0.75 * common(without)[1]
     assert result.calibration.provenance["geometry"]["heights"] == ["robot0", "robot1", "robot2"]
 
 
@@ -158,10 +149,9 @@ def test_walls_between_bodies_are_named_and_in_the_intervals(between_m):
     flown = flight(seconds=6.0, rate=120, anchors=CORNERS, late_m=late)
     result = calib.fit_from_ranges(flown, poses_until_s=4.0, heading_std_deg=0.0)
     assert bool([text for text in result.warnings if text.startswith("errors depend on places")]) == (between_m > 0)
-    planted = flown.planted["delays_ns"]
-    assert largest_score(result, planted) < 2.5
+    planted, found = flown.planted["delays_ns"], result.calibration.delays_ns
+    assert largest_score(result, {int(tag): delay for tag, delay in planted.items()}) < 2.5
     # Walls of 5 cm shift delays by about 100 ps; without them they are known to half of that.
-    found = result.calibration.delays_ns
     assert (max(abs(found[int(tag)] - delay) for tag, delay in planted.items()) > 0.08) == (between_m > 0)
 
 
@@ -170,7 +160,7 @@ def test_common_reflections_of_two_bodies_are_named(blocked):
     flown = flight(seconds=20.0, rate=120, seed=3, blocked=blocked)
     result = calib.fit_from_ranges(flown, poses_until_s=5.0, heading_std_deg=0.0, minimum_norm=True)
     assert bool([text for text in result.warnings if "are reflected together" in text]) == (blocked == "bodies")
-    assert largest_score(result) < 2.5
+    assert largest_score(result, DELAYS_NS) < 2.5
 
 
 # A recorded flight (MILUV: three robots, six anchors, 317 exchanges), with little or none of its motion capture; and a
@@ -182,11 +172,16 @@ def flown(tmp_path_factory):
     return importers.read_source(miluv(tmp_path_factory.mktemp("miluv")), importer="miluv")
 
 
+def true_errors(found, flown):
+    """Return errors of estimated distances (n,) in metres, by those of motion capture."""
+    truth = calib.load_ranges(flown)
+    return found.ranges.truth_m - truth.truth_m[np.searchsorted(truth.time_ns, found.ranges.time_ns)]
+
+
 def joint_scores(found, flown):
     """Return differences from a fit with all of the motion capture divided by joint standard errors, of all boards."""
-    whole = calib.fit(flown, loss="cauchy").calibration
+    whole, tags = calib.fit(flown, loss="cauchy").calibration, found.uncertainty.tags
     std = np.sqrt(np.diag(found.uncertainty.delays_ns2))
-    tags = found.uncertainty.tags
     differ = np.array([found.delays_ns[tag] - whole.delays_ns[tag] for tag in tags])
     return differ / np.hypot(std, [whole.delays_std_ns[tag] for tag in tags])
 
@@ -194,8 +189,7 @@ def joint_scores(found, flown):
 @pytest.mark.slow
 def test_ten_seconds_of_motion_capture_an_imu_and_heights_follow_a_real_flight(flown):
     found = calib.fit_from_ranges(flown, poses_until_s=10.0, attitudes="imu")
-    truth = calib.load_ranges(flown)
-    away = found.ranges.truth_m - truth.truth_m[np.searchsorted(truth.time_ns, found.ranges.time_ns)]
+    away = true_errors(found, flown)
     # Four ranges per second for three robots: accelerometer and height determine the motion between them.
     assert abs(np.median(away)) < 0.03
     assert np.median(np.abs(away)) < 0.1
@@ -240,12 +234,11 @@ IMU = {"grade": "consumer", "vibration_mps2": 1.0}
 
 @pytest.fixture(scope="module")
 def flown_with_imus():
-    bodies: list[dict[str, Any]] = []
-    for name, x in BOXES.items():
-        motion = {"model": "random-flight", "box_min_m": [x, -2.6, 0.4], "box_max_m": [x + 2.2, -0.2, 2.6]}
-        bodies.append({"name": name, "motion": motion, "imu": IMU})
-    for k, place in enumerate(CORNERS):
-        bodies.append({"name": f"anchor{k}", "motion": {"model": "static", "position_m": place}})
+    boxes = {name: {"box_min_m": [x, -2.6, 0.4], "box_max_m": [x + 2.2, -0.2, 2.6]} for name, x in BOXES.items()}
+    bodies: list[Any] = [
+        {"name": name, "motion": {"model": "random-flight"} | box, "imu": IMU} for name, box in boxes.items()
+    ]
+    bodies += [{"name": f"anchor{k}", "motion": {"model": "static", "position_m": at}} for k, at in enumerate(CORNERS)]
     arms = {1: ("a", 0.17), 2: ("a", -0.17), 3: ("b", 0.17), 4: ("b", -0.17)}
     tags = [{"id": t, "body": b, "lever_arm_m": [x, -x, -0.05], "delay_ns": 0.1 * t} for t, (b, x) in arms.items()]
     tags += [{"id": 11 + k, "body": f"anchor{k}", "delay_ns": -0.1 * k} for k in range(4)]
@@ -292,8 +285,7 @@ def test_a_heading_wrong_by_a_right_angle_is_corrected(flown_with_imus):
 @pytest.mark.slow
 def test_inertial_readings_and_anchors_are_enough(flown_with_imus):
     found = calib.fit_from_ranges(flown_with_imus, poses_until_s=0.0, attitudes="imu")
-    truth = calib.load_ranges(flown_with_imus)
-    away = found.ranges.truth_m - truth.truth_m[np.searchsorted(truth.time_ns, found.ranges.time_ns)]
+    away = true_errors(found, flown_with_imus)
     # No position and no heading of a robot is given.
     assert np.std(away) < 0.03
     assert abs(np.mean(away)) < 0.01
