@@ -13,6 +13,7 @@ import pytest
 
 import calib
 from calib.calibration import formats, model, patterns
+from calib.calibration.error_model import FeatureSlope
 from calib.calibration.power_curves import flat_curve
 from tests.calib.synthetic import DELAYS_NS, ranges
 from tests.shared_data import miluv, shared
@@ -34,17 +35,19 @@ def test_undetermined_delays_are_exported_where_there_is_a_form_for_them(fitted)
 
 def test_registers_add_to_programmed_delays(tmp_path, fitted):
     known = replace(fitted, delays_ns={1: 0.25, 2: -513.5})
-    single = {"configured_antenna_delay_ticks_by_tag": {"1": {"tx": 16440, "rx": 16430}}}
-    meta = {"configured_antenna_delay_ticks": {"tx": 0, "rx": 0}, **single}
+    meta = {
+        "configured_antenna_delay_ticks": {"tx": 0, "rx": 0},
+        "configured_antenna_delay_ticks_by_tag": {"1": {"tx": 16440, "rx": 16430}},
+    }
     Contents(exchanges=calib.sample_flight(10).exchanges, meta=meta).save(tmp_path / "r.uwb")
-    found = formats.registers(known, formats.programmed(tmp_path / "r.uwb"))
-    d = 0.25e-9 / ticks.TICK_S
+    base, d = formats.programmed(tmp_path / "r.uwb"), 0.25e-9 / ticks.TICK_S
+    found = formats.registers(known, base)
     assert found[1] == (round(16440 - 0.44 * d), round(16430 - 0.56 * d), 16440)
     # A device with registers of zero: both registers together are its whole delay, not 32872 ticks more.
     assert sum(found[2][:2]) == pytest.approx(513.5e-9 / ticks.TICK_S, abs=1)
     with pytest.raises(calib.BadInputError, match="tag 1: its registers would be -7/-9"):
         formats.registers(known, {None: AntennaDelay(0, 0, 0)})
-    text = calib.export(known, "registers", base=formats.programmed(tmp_path / "r.uwb"))
+    text = calib.export(known, "registers", base=base)
     assert tomllib.loads(text)["antenna_delays"]["tags"]["1"] == found[1]._asdict()
 
 
@@ -163,9 +166,11 @@ int main(void)
 """
 
 
+SLOPES = (patterns.TemperatureSlope((1, 2, 3, 7), 0.005, 0.0002, 27.5, (20.0, 35.0)),)
+
+
 def test_the_c_header_states_the_effect_of_temperatures(tmp_path, fitted):
-    slopes = (patterns.TemperatureSlope((1, 2, 3, 7), 0.005, 0.0002, 27.5, (20.0, 35.0)),)
-    known, expected = replace(fitted, temperatures=slopes), list[float]()
+    known, expected = replace(fitted, temperatures=SLOPES), list[float]()
     plain = fitted.correct(3.0, -85.0, -86.0, 1, 3)
     for celsius in ((30.0, 24.5), (30.0, np.nan), (np.nan, np.nan)):
         seen = known.correct(3.0, -85.0, -86.0, 1, 3, temperature_c=celsius)
@@ -202,8 +207,7 @@ def test_the_published_calibration_gives_the_published_ranges(tmp_path):
         formats.read_miluv(shared("miluv_published_calibration.json")).apply(calib.Ranges.from_exchanges(e)).corrected_m
     )
     off = found - [published[one] for one in ends]
-    assert len(off) == 317
-    assert np.abs(off).max() < 0.015
+    assert (len(off), np.abs(off).max() < 0.015) == (317, True)
     assert np.sqrt(np.mean(off**2)) < 0.006
 
 
@@ -238,11 +242,21 @@ def test_miluv_calibrations_with_infinite_numbers_are_refused(tmp_path, old, new
         formats.read_miluv(tmp_path / "m.json")
 
 
-def test_formats_with_one_curve_refuse_groups(fitted):
-    groups = {"a": model.TagGroup((1, 2), fitted.bias_curve, fitted.sigma_curve)}
-    groups["b"] = replace(groups["a"], tags=(3, 7))
-    grouped = replace(fitted, groups=groups)
-    for form in ("miluv", "ros-yaml", "c-header"):
-        with pytest.raises(calib.BadInputError, match="export it as json"):
-            calib.export(grouped, form)
-    assert calib.Calibration.from_json(calib.export(grouped, "json")) == grouped
+def test_json_keeps_every_part_and_other_formats_refuse_what_they_have_no_fields_for(fitted):
+    """Programs that know no such part refuse the file by its version."""
+    curves, open_ns = (fitted.bias_curve, fitted.sigma_curve), dict.fromkeys(DELAYS_NS, math.inf)
+    groups = {"a": model.TagGroup((1, 2), *curves), "b": model.TagGroup((3, 7), *curves)}
+    for changes, version, forms, said in (
+        ({"errors": replace(fitted.errors, features={"rise_taps": FeatureSlope(1.0, 2.0, (1.0, 9.0))})}, 1, (), ""),
+        ({"groups": groups}, 2, ("miluv", "ros-yaml", "c-header"), ""),
+        ({"pair_offsets": {(1, 2): model.PairOffset(0.1, 0.01)}}, 4, ("csv", "c-header"), "no fields for constants"),
+        ({"undetermined_splits": (((1, 7), (2, 3)),), "delays_std_ns": open_ns}, 5, (), ""),
+        ({"patterns": (pattern((1, 2), 1),)}, 6, ("miluv", "ros-yaml"), "no fields for patterns over direction"),
+        ({"temperatures": SLOPES}, 7, ("miluv", "ros-yaml"), "no fields for slopes over temperature"),
+    ):
+        known = replace(fitted, **changes)
+        for form in forms:
+            with pytest.raises(calib.BadInputError, match=f"{said}.*export it as json"):
+                calib.export(known, form)
+        text = calib.export(known, "json")
+        assert (calib.Calibration.from_json(text), json.loads(text)["schema_version"]) == (known, version)

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 from dataclasses import replace
 
 import duckdb
@@ -32,15 +33,10 @@ def test_json_both_ways_without_loss(fitted, tmp_path, changes, version):
     assert json.loads(known.to_json())["schema_version"] == version
 
 
-def lifted(dbm):
-    return 10 ** ((dbm + 82) / 10)
-
-
-def powers_at(lift, power_at, first, second):
-    """Return the lifted powers at which the bias is evaluated."""
-    if power_at == "reception":
-        return [lifted(first), lifted(second)]
-    return [lifted((first + second) / 2) if lift == "lift-of-mean" else (lifted(first) + lifted(second)) / 2]
+def powers_at(lift, power_at, dbm):
+    """Return the lifted powers at which the bias is evaluated, from those of both ends."""
+    lifted, of_mean = (10 ** ((np.array(one) + 82) / 10) for one in (dbm, np.mean(dbm)))
+    return lifted if power_at == "reception" else [of_mean if lift == "lift-of-mean" else lifted.mean()]
 
 
 @pytest.mark.parametrize(
@@ -68,11 +64,10 @@ def test_ranges_are_corrected_by_the_formulas(fitted, lift, power_at, grouped, p
     (i, j), share = ends, sum(tag > 2 for tag in ends) / 2 if grouped else 0.0
     found = known.correct(3.0, *printed, i, j, weights=(0.5, 0.50001))
     delays = SPEED_OF_LIGHT * 1e-9 * (0.5 * known.delays_ns[i] + 0.50001 * known.delays_ns[j])
-    spline, at = interpolate.BSpline(curve.knots, curve.coefficients, 3), powers_at(lift, power_at, *both)
+    spline, at = interpolate.BSpline(curve.knots, curve.coefficients, 3), powers_at(lift, power_at, both)
     bias = np.mean([spline(np.clip(one, *curve.range)) for one in at]) - 0.1 * share
-    assert found.range_m == pytest.approx(3.0 + delays - bias, abs=1e-9)
-    assert type(found.range_m) is float
-    (middle,) = powers_at(lift, "exchange", *both)
+    assert (found.range_m, type(found.range_m)) == (pytest.approx(3.0 + delays - bias, abs=1e-9), float)
+    (middle,) = powers_at(lift, "exchange", both)
     at_both = replace(known, power_at="exchange").correct(3.0, *both, i, j)
     assert found.sigma_m == at_both.sigma_m == pytest.approx((1 + share) * sigma(np.clip(middle, *sigma.range)))
     together = known.correct(np.array([3.0, 4.0]), *printed, i, [j, j], weights=(0.5, 0.50001))
@@ -84,10 +79,9 @@ def test_ranges_without_power_have_no_sigma_and_those_beyond_the_curve_a_larger_
     blind = fitted.correct(3.0, 0.0, np.nan, 1, 2)
     assert blind.range_m == pytest.approx(3.0 + SPEED_OF_LIGHT * 5e-10 * (fitted.delays_ns[1] + fitted.delays_ns[2]))
     assert np.isnan([blind.sigma_m, blind.sigma_total_m, blind.tail_share]).all()
-    assert not blind.clamped
-    far = fitted.correct(3.0, -60.0, -60.0, 1, 2)
-    assert far.clamped
-    assert far.sigma_total_m > fitted.correct(3.0, -79.0, -79.0, 1, 2).sigma_total_m
+    far, near = (fitted.correct(3.0, dbm, dbm, 1, 2) for dbm in (-60.0, -79.0))
+    assert (blind.clamped, far.clamped) == (False, True)
+    assert far.sigma_total_m > near.sigma_total_m
 
 
 def test_the_band_of_a_polygon_is_that_of_its_corners(fitted):
@@ -104,9 +98,9 @@ def test_the_band_of_a_polygon_is_that_of_its_corners(fitted):
 def test_factors_of_a_pair_hold_in_both_directions(fitted, name):
     errors = replace(fitted.errors, pairs={name: PairErrors(1.0, 3.0, 1.0)})
     known = Calibration.from_json(replace(fitted, errors=errors).to_json())
-    there, back, other = (known.correct(3.0, -85.0, -86.0, *ends).tail_share for ends in ((1, 2), (2, 1), (1, 3)))
-    assert there == back
-    assert there / (1 - there) == pytest.approx(3 * other / (1 - other))
+    share = np.array([known.correct(3.0, -85.0, -86.0, *ends).tail_share for ends in ((1, 2), (2, 1), (1, 3))])
+    there, back, other = share / (1 - share)
+    assert there == back == pytest.approx(3 * other)
 
 
 @pytest.mark.parametrize(
@@ -139,35 +133,6 @@ def test_what_a_calibration_cannot_be_used_for_is_named(fitted, use, error, said
         use(fitted)
 
 
-SLOPE = '{"tags": [%d], "m_per_k": 0.002, "std_m_per_k": 0.0, "reference_c": 25.0, "span_c": [20, 30]}'
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ('"degree": 3', '"degree": 9'),
-        ('"loss": "mixture"', '"loss": 5'),
-        ('"delays_ns": {', '"delays_ns": {"x": 1, '),
-        ('"alpha_dbm": -82.0', '"alpha_dbm": "low"'),
-        ('"alpha_dbm": -82.0', '"alpha_dbm": -82.0, "power_at": "somewhere"'),
-        ('"speed_of_light": 299702547.0', '"speed_of_light": NaN'),
-        ('"scale_ns": ', '"scale_ns": 1e300, "was": '),
-        ('"tags": [', '"tags": [9, '),
-        ('"provenance": {', '"provenance": {"added": 1e400, '),
-        ('"provenance": {', '"provenance": {"added": -Infinity, '),
-        ('"provenance": {', f'"provenance": {{"added": {"[" * 300}{"]" * 300}, '),
-        ('"provenance": {', '"provenance": {"drift": {"m2_per_day": "fast"}, '),
-        ('"provenance": {', f'"temperatures": [{SLOPE % 9}], "provenance": {{'),
-        ('"provenance": {', f'"temperatures": [{SLOPE % 1}, {SLOPE % 1}], "provenance": {{'),
-    ],
-)
-def test_a_damaged_file_is_one_clear_error(fitted, old, new):
-    text = fitted.to_json()
-    assert old in text
-    with pytest.raises(calib.BadInputError, match=r"^here"):
-        Calibration.from_json(text.replace(old, new), "here")
-
-
 # A corrected recording: the ranges that `evaluate` uses, and all other rows of all tables unchanged.
 
 
@@ -185,20 +150,19 @@ def full_recording(path):
         faults=[Fault(5, "1", "time-out", "no answer")], cirs=[CirRow(9, 1, 1, 2, 741.25, tuple(range(1016)))],
         frames=[FrameRow(7, "1", "in", b"\x00\xff raw"), FrameRow(8, "1", "out", b"C05")],
     ).save(path)  # fmt: skip
-    kinds = {"BIGINT": np.array([11]), "VARCHAR": np.array(["b1"]), "DOUBLE": np.array([0.5])}
-    kinds |= {"USMALLINT": np.array([3])}
+    kinds = {"BIGINT": [11], "VARCHAR": ["b1"], "DOUBLE": [0.5], "USMALLINT": [3]}
     with Recording.open(path, update=True) as recording:
         recording.append("overheard", [{name: float(k) for k, name in enumerate(TABLES["overheard"])}])
         # Without "corrected", which is the result.
         names = ("imu", "height", "powers", "quality", "receptions", "differences", "temperature")
         for table in (*names, "arrangements", "distances"):
-            recording.append(table, {name: kinds[kind] for name, kind in TABLES[table].items()})
+            recording.append(table, {name: np.array(kinds[kind]) for name, kind in TABLES[table].items()})
 
 
 def rows(path, table):
     with duckdb.connect(str(path), read_only=True) as db:
-        found = db.execute(f"SELECT * FROM {table}").fetchall()
-        return [column[0] for column in db.description], found
+        found = db.execute(f"SELECT * FROM {table}")
+        return [column[0] for column in found.description], found.fetchall()
 
 
 @pytest.fixture(scope="module")
@@ -255,9 +219,8 @@ def test_ranges_without_power_are_counted_apart(corrected):
     folder, _, done = corrected
     names, table = rows(folder / "c.uwb", "corrected")
     clamped, sigma_m = (np.array([row[names.index(name)] for row in table], float) for name in ("clamped", "sigma_m"))
-    counted = np.count_nonzero(clamped), np.count_nonzero(np.isnan(sigma_m))
-    assert (done.count, done.clamped, done.unpowered) == (600, *counted)
-    assert done.unpowered == 7
+    assert (done.count, done.clamped, done.unpowered) == (600, np.count_nonzero(clamped), 7)
+    assert np.count_nonzero(np.isnan(sigma_m)) == 7
 
 
 @pytest.mark.filterwarnings("ignore:1 differences of arrival without stamps are copied")
@@ -289,21 +252,19 @@ MODEL = ErrorModel(
 
 def test_errors_far_beyond_all_densities_are_outliers():
     shapes = MODEL.shapes(np.full(3, 0.5), np.full(3, 1), np.full(3, 2))
-    tail, outlier = MODEL.tail_given(np.array([-3.0, 80.0, 1e6]), shapes)
-    assert outlier[0] > 0.999
-    assert outlier[2] == 1.0
+    tail, (near, _, far) = MODEL.tail_given(np.array([-3.0, 80.0, 1e6]), shapes)
+    assert 0.999 < near <= far == 1.0
     assert np.isfinite(tail).all()
 
 
 def test_probabilities_given_an_error_agree_with_scipy():
-    model = replace(MODEL, outlier_share=0.05, outlier_m=3.0)
-    error = np.linspace(-1, 4, 101)
+    model, error = replace(MODEL, outlier_share=0.05, outlier_m=3.0), np.linspace(-1, 4, 101)
     shapes = model.shapes(np.full(101, 0.5), np.full(101, 3), np.full(101, 7))
     core = 0.95 * 0.8 * stats.norm.pdf(error - 0.02, scale=0.05)
     tail = 0.95 * 0.2 * stats.exponnorm.pdf(error - 0.02, 0.3 / 0.05, loc=0.05, scale=0.05)
     wild = 0.05 * stats.norm.pdf(error - 0.02, scale=3.0)
-    found = model.tail_given(error, shapes)
-    np.testing.assert_allclose(found, [tail / (core + tail + wild), wild / (core + tail + wild)], atol=1e-9)
+    expected = np.array([tail, wild]) / (core + tail + wild)
+    np.testing.assert_allclose(model.tail_given(error, shapes), expected, atol=1e-9)
 
 
 def test_error_models_may_be_missing(fitted):
@@ -321,9 +282,39 @@ def test_error_models_may_be_missing(fitted):
         old.quantiles(flight)
 
 
+SLOPE = {"tags": [1], "m_per_k": 0.002, "std_m_per_k": 0.0, "reference_c": 25.0, "span_c": [20, 30]}
+FEATURE = {"log_odds": 1.0, "centre": 2.0, "bounds": [1.0, 9.0]}
+DRIFT = {"sessions": 2, "days": "x", "m2_per_day": [0, 1, 2], "told": 1, "by_age": 1}
+PATTERN = {"tags": [1, 2], "coefficients_m": [0.0] * 8, "covariance_m2": [[0.0] * 8] * 8, "rms_m": 0.01}
+
+
 @pytest.mark.parametrize(
     ("path", "value", "said"),
     [
+        ("bias_curve/degree", 9, "bias_curve"),
+        ("loss", 5, "loss"),
+        ("delays_ns/x", 1, "delays_ns"),
+        ("alpha_dbm", "low", "alpha_dbm"),
+        ("power_at", "somewhere", "power_at"),
+        ("speed_of_light", math.nan, ""),
+        ("scale_ns", 1e300, "scale_ns"),
+        ("uncertainty/tags", [9, 1, 2, 3, 7], "uncertainty"),
+        ("provenance/added", "1e400", ""),
+        ("provenance/added", -math.inf, ""),
+        ("provenance/added", "deep", ""),
+        ("provenance/drift", {"m2_per_day": "fast"}, "provenance: drift"),
+        ("provenance/drift", {}, "provenance: drift"),
+        ("provenance/drift", DRIFT, "provenance: drift"),
+        ("temperatures", [SLOPE | {"tags": [9]}], "temperatures"),
+        ("temperatures", [SLOPE] * 2, "temperatures"),
+        ("temperatures", [SLOPE | {"span_c": [-500, 30]}], "temperatures.*span_c"),
+        ("temperatures", [SLOPE | {"span_c": [30, 20]}], "span_c: expected the lowest before the highest"),
+        ("patterns", [PATTERN | {"centre": [0.0] * 7}], "patterns.*8"),
+        ("undetermined_splits", [[[1, 9], [3, 7]]], "undetermined_splits: expected calibrated tags, each one once"),
+        ("errors/features", {"colour": FEATURE}, "features.*rise_taps"),
+        ("errors/features", {"rise_taps": FEATURE | {"bounds": [9.0, 1.0]}}, "features: rise_taps: bounds"),
+        ("errors/features", {"rise_taps": FEATURE | {"log_odds": 1e9}}, "features: rise_taps: log_odds"),
+        ("errors/features", {"rise_taps": FEATURE | {"bounds": 3.0}}, "features: rise_taps: bounds"),
         ("speed_of_light", 0, "speed_of_light"),
         ("speed_of_light", 3e5, "speed_of_light"),
         ("delays_ns/2", 9.2e18, "delays_ns"),
@@ -360,8 +351,9 @@ def test_impossible_values_in_files_are_refused_by_name(fitted, path, value, sai
     for key in outer:
         inner = inner[int(key) if isinstance(inner, list) else key]
     inner[int(last) if isinstance(inner, list) else last] = value
-    with pytest.raises(calib.BadInputError, match=f"(?s)^here: .*{said}"):
-        Calibration.from_json(json.dumps(table), "here")
+    text = json.dumps(table).replace('"1e400"', "1e400").replace('"deep"', 300 * "[" + 300 * "]")
+    with pytest.raises(calib.BadInputError, match=rf"\Ahere: .*{said}.*\Z"):  # one line
+        Calibration.from_json(text, "here")
 
 
 def test_a_fit_estimates_the_persistence_of_errors():
@@ -371,10 +363,9 @@ def test_a_fit_estimates_the_persistence_of_errors():
     shared = signal.lfilter([1.0], [1.0, -keep], steps, axis=0).ravel()
     found = calib.fit(replace(flight, raw_m=flight.raw_m + shared)).calibration
     lasting = found.errors.lasting
-    assert lasting.lasting_variance == pytest.approx(0.5, abs=0.1)
-    assert (lasting.own_variance, lasting.time_s) == (pytest.approx(0.5, abs=0.1), pytest.approx(0.5, rel=0.4))
-    assert abs(lasting.mean) < 0.1
-    assert Calibration.from_json(found.to_json()) == found
+    assert (lasting.lasting_variance, lasting.own_variance) == pytest.approx((0.5, 0.5), abs=0.1)
+    assert (lasting.time_s, lasting.mean) == (pytest.approx(0.5, rel=0.4), pytest.approx(0.0, abs=0.1))
+
     assert calib.fit(flight).calibration.errors.lasting.lasting_variance < 0.05
 
 
@@ -407,8 +398,7 @@ def test_fits_of_the_same_tags_differ_in_5_percent_of_comparisons():
 
 def test_a_changed_delay_is_detected(fitted):
     found = calib.compare(fitted, replace(fitted, delays_ns=fitted.delays_ns | {3: fitted.delays_ns[3] + 0.2}))
-    assert not found.same
-    assert max(found.difference_ns, key=lambda t: abs(found.difference_ns[t])) == 3
+    assert (found.same, max(found.difference_ns, key=lambda t: abs(found.difference_ns[t]))) == (False, 3)
     assert f"{found.difference_ns[3]:+.4f} ns" in str(found)
 
 
@@ -417,8 +407,7 @@ def test_a_common_shift_of_delays_and_curve_is_no_difference(fitted):
     curve = replace(fitted.bias_curve, coefficients=tuple(c + 0.05 for c in fitted.bias_curve.coefficients))
     found = calib.compare(fitted, replace(fitted, delays_ns=moved_ns, bias_curve=curve))
     assert found.same
-    assert [found.offset_m, found.curve_rms_m] == pytest.approx([0, 0], abs=1e-9)
-    assert np.abs(list(found.difference_ns.values())).max() < 1e-9
+    assert [found.offset_m, found.curve_rms_m, *found.difference_ns.values()] == pytest.approx([0] * 6, abs=1e-9)
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import pytest
 from scipy import interpolate, stats
 
 import calib
+from calib.calibration import held_out_line
 from calib.data.ranges import Ranges, concatenate
 from calib.evaluation import statistics
 from calib.figures import errors_by_pair
@@ -35,9 +36,8 @@ def test_errors_are_split_into_within_and_between_pairs_and_sessions(pairs_m, se
 
 def test_evaluations_compare_with_planted_values():
     curve = interpolate.make_interp_spline(np.linspace(-0.5, 2.5, 60), bias_m(np.linspace(-0.5, 2.5, 60)))
-    planted: dict[str, object] = {"delays_ns": {str(t): d for t, d in DELAYS_NS.items()}}
-    planted["bias_curve"] = {"knots": curve.t.tolist(), "coefficients": curve.c.tolist(), "degree": 3}
-    r = replace(ranges(), planted=planted)
+    spline = {"knots": curve.t.tolist(), "coefficients": curve.c.tolist(), "degree": 3}
+    r = replace(ranges(), planted={"delays_ns": {str(t): d for t, d in DELAYS_NS.items()}, "bias_curve": spline})
     known = calib.fit(r).calibration
     found = statistics.evaluate(r, known).planted
     assert sum(found.delay_error_ns.values()) == pytest.approx(0, abs=1e-12)
@@ -53,22 +53,20 @@ def test_evaluations_compare_with_planted_values():
     delays_m = 1e-9 * SPEED_OF_LIGHT * np.array([DELAYS_NS.get(tag, 0.0) for tag in range(8)])
     clean = bias_m(applied.lifted) - r.weight_initiator * delays_m[r.initiator] - r.weight_target * delays_m[r.target]
     wrong = (applied.corrected_m - r.raw_m + clean)[~applied.clamped]
-    assert found.correction_rms_m == pytest.approx(np.sqrt(np.mean(wrong**2)), rel=0.02)
-    assert found.correction_rms_m < 0.005
+    assert pytest.approx(np.sqrt(np.mean(wrong**2)), rel=0.02) == found.correction_rms_m < 0.005
 
 
 @pytest.fixture(scope="module")
 def found():
-    r = ranges(2000)
-    return statistics.evaluate(r, calib.fit(r).calibration)
+    return statistics.evaluate(ranges(2000), calib.fit(ranges(2000)))
 
 
 def test_an_evaluation_prints_on_a_screen(found):
     lines = repr(found).splitlines()
     assert max(map(len, lines[1:])) <= 80, "a terminal has room for every figure"
-    cells, full = lines[-1].split(), found.overall.full
-    assert cells[:2] == ["all", "2000"]
-    assert cells[8:11] == [f"{100 * value:.1f}" for value in (full.mean_m, full.median_m, full.robust_std_m)]
+    (name, count, *cells), full = lines[-1].split(), found.overall.full
+    numbers = [f"{100 * value:.1f}" for value in (full.mean_m, full.median_m, full.robust_std_m)]
+    assert (name, count, cells[6:9]) == ("all", "2000", numbers)
     page = found._repr_html_()
     assert (page.count("<tr>"), page.count("data:image/png")) == (3 + 6, 1)
 
@@ -106,11 +104,13 @@ def test_a_part_that_is_held_out_judges_a_fit_to_the_others():
     found = calib.fit(flight, hold_out=0.3).calibration
     assert found.delays_ns == plain.delays_ns, "what is returned is fitted to all"
     told = found.provenance["held_out"]
-    assert 0.25 * len(flight) < told["ranges"] < 0.35 * len(flight)
+    assert told["ranges"] / len(flight) == pytest.approx(0.3, abs=0.05)
     assert abs(told["median_m"]) < 0.01 < abs(told["raw_median_m"])
     assert told["robust_std_m"] == pytest.approx(0.03, rel=0.1)
     assert told["inside_95"] > 0.9
     assert "held_out" not in plain.provenance
+    with pytest.raises(calib.BadInputError, match="provenance: held_out"):
+        held_out_line(replace(plain, provenance={"held_out": {"ranges": "x"}}))
 
 
 @pytest.mark.parametrize(

@@ -17,16 +17,11 @@ from calib.calibration import formats, power_curves
 from calib.data.features import response_features
 from calib.online import range_errors
 from tests.calib.synthetic import about_their_mean
-from tests.processes import refuse, succeed
+from tests.processes import succeed
 from tests.shared_data import miluv, shared
 from uwblink.importers import read_source
 from uwblink.recording.schema import CirRow
 from uwbsim import simulate
-
-
-def halves(ranges):
-    first = ranges.time_ns < np.median(ranges.time_ns)
-    return ranges[first], ranges[~first]
 
 
 @pytest.mark.parametrize(
@@ -41,8 +36,9 @@ def halves(ranges):
     ],
 )
 def test_held_back_flights_of_foreign_worlds(name, loss, seed, tolerance):
-    fitted, held = halves(make(CLEAN[name], seed).ranges)
-    found = calib.evaluate(held, calib.fit(fitted, loss=loss, between_m=0.0).calibration).overall
+    ranges = make(CLEAN[name], seed).ranges
+    first = ranges.time_ns < np.median(ranges.time_ns)
+    found = calib.evaluate(ranges[~first], calib.fit(ranges[first], loss=loss, between_m=0.0)).overall
     assert 0.96 - tolerance < found.total_std < 1.08
     assert found.inside_95 == pytest.approx(0.95, abs=tolerance)
     if loss == "mixture":
@@ -53,9 +49,8 @@ def test_held_back_flights_of_foreign_worlds(name, loss, seed, tolerance):
 
 def of_pairs(ranges, values):
     """Return means of values by pair, in the order of the pairs."""
-    low, high = np.minimum(ranges.initiator, ranges.target), np.maximum(ranges.initiator, ranges.target)
-    ends = sorted({*zip(low.tolist(), high.tolist(), strict=True)})
-    return {f"{a}-{b}": values[(low == a) & (high == b)].mean() for a, b in ends}
+    ends = np.sort(ranges.ends, axis=1)
+    return {f"{a}-{b}": values[(ends == (a, b)).all(axis=1)].mean() for a, b in np.unique(ends, axis=0)}
 
 
 def test_pairs_have_the_share_of_reflections_that_was_planted():
@@ -80,9 +75,8 @@ def test_a_power_beyond_the_curve_widens_the_total():
     low, high = known.bias_curve.range
     power = power_curves.ALPHA_DBM + 10 * np.log10([high, 1.5 * high, 3 * high])
     ranges = calib.Ranges.from_arrays(np.full(3, 3.0), initiator=1, target=2, fpp1_dbm=power, fpp2_dbm=power)
-    total = known.apply(ranges).sigma_total_m
-    step = 0.1 * (high - low)
-    slope = (known.bias_curve(np.array([high]))[0] - known.bias_curve(np.array([high - step]))[0]) / step
+    total, step = known.apply(ranges).sigma_total_m, 0.1 * (high - low)
+    slope = np.diff(known.bias_curve(np.array([high - step, high])))[0] / step
     np.testing.assert_allclose(total**2 - total[0] ** 2, (slope * np.array([0, 0.5, 2.0]) * high) ** 2, atol=1e-9)
     width = np.ptp(known.quantiles(ranges), axis=1)
     assert width[2] / width[0] == pytest.approx(total[2] / total[0], rel=1e-9)
@@ -96,10 +90,9 @@ def test_the_total_sigma_holds_where_reflections_are_of_two_kinds():
     ranges = replace(ranges, raw_m=ranges.raw_m + detour * (rng.random(len(ranges)) < 0.12))
     calibration = calib.fit(ranges).calibration
     applied = calibration.apply(ranges)
-    error = applied.corrected_m - ranges.truth_m
-    assert np.sqrt(np.mean(applied.sigma_total_m**2)) == pytest.approx(error.std(), rel=0.05)
-    # The written model is read unchanged; a file with one kind is read as before, with the mean error that it had.
-    assert calib.Calibration.from_json(calibration.to_json()) == calibration
+    std = np.std(applied.corrected_m - ranges.truth_m)
+    assert np.sqrt(np.mean(applied.sigma_total_m**2)) == pytest.approx(std, rel=0.05)
+    # A file with one kind is read as before, with the mean error that it had.
     table = json.loads(calibration.to_json())
     del table["errors"]["long_share"], table["errors"]["long_factor"]
     older = calib.Calibration.from_json(json.dumps(table)).apply(ranges)
@@ -193,10 +186,6 @@ def fitted(seed, **planted):
     return calib.fit(world(seed, **planted)[0], between_m=0.0).calibration
 
 
-def without_features(ranges):
-    return replace(ranges, features=np.full_like(ranges.features, np.nan))
-
-
 @pytest.mark.parametrize(("seed", "planted"), [(71, {}), (72, {}), (73, {"rise": 0.0, "excess": 0.0})])
 def test_planted_slopes_are_found(seed, planted):
     found = fitted(seed, **planted).errors.features
@@ -209,13 +198,11 @@ def test_planted_slopes_are_found(seed, planted):
 def test_probabilities_hold_in_ranges_that_were_not_fitted():
     ranges, share, reflected = world(74)
     told = fitted(71).apply(ranges).tail_share
-    edges = np.quantile(told, np.linspace(0, 1, 11)[1:-1])
-    for k in range(10):
-        some = np.digitize(told, edges) == k
-        # 800 ranges determine a share to 0.018; slopes and level add as much.
-        assert told[some].mean() == pytest.approx(reflected[some].mean(), abs=0.055)
+    # 800 ranges determine a share to 0.018; slopes and level add as much.
+    tenths = np.argsort(told).reshape(10, -1)
+    np.testing.assert_allclose(told[tenths].mean(axis=1), reflected[tenths].mean(axis=1), atol=0.055)
     # Power alone predicts nearly the same for all.
-    alone = fitted(71).apply(without_features(ranges)).tail_share
+    alone = fitted(71).apply(replace(ranges, features=np.full_like(ranges.features, np.nan))).tail_share
     assert np.mean((told - share) ** 2) < 0.1 * np.mean((alone - share) ** 2)
     # Filters are given the probability of each range.
     assert np.corrcoef(range_errors(fitted(71), ranges)[1].share, share)[0, 1] > 0.98
@@ -234,23 +221,6 @@ def test_odds_are_constant_beyond_the_fitted_values():
     assert shares[0] < shares[1] == shares[2]
 
 
-def test_files_keep_the_slopes_and_refuse_others(tmp_path):
-    known = fitted(71)
-    assert calib.Calibration.from_json(known.to_json()).errors == known.errors
-    table, good = json.loads(known.to_json()), {"log_odds": 1.0, "centre": 2.0, "bounds": [1.0, 9.0]}
-    for name, change in (
-        ("colour", {}),
-        ("rise_taps", {"bounds": [9.0, 1.0]}),
-        ("rise_taps", {"log_odds": 1e9}),
-        ("rise_taps", {"bounds": 3.0}),
-    ):
-        table["errors"]["features"] = {name: good | change}
-        (tmp_path / "c.json").write_text(json.dumps(table))
-        refuse("calib", "show", tmp_path / "c.json", naming=["features", "rise_taps", *change])
-    with pytest.raises(calib.BadInputError, match="colour"):
-        calib.Ranges.from_arrays([3.0], initiator=1, target=2, features={"colour": 1.0})
-
-
 def response(rise, first=740.3, noise=10, late=0, length=1016):
     """Return the taps of a response: noise, a path that rises within some taps from before the first path, and a later
     one.
@@ -258,8 +228,7 @@ def response(rise, first=740.3, noise=10, late=0, length=1016):
     rng = np.random.default_rng(5)
     taps = np.abs(rng.normal(0, noise, length)) + np.abs(rng.normal(0, noise, length))
     at = int(first) + 2
-    for k in range(rise + 1):
-        taps[at - k] += 2000 * (1 - k / (rise + 1))
+    taps[at - rise : at + 1] += 2000 * np.arange(1, rise + 2) / (rise + 1)
     taps[at + 1 : at + 4] += (1400, 600, 100)
     taps[int(first) + 40] += late
     return [int(tap) for tap in taps]
@@ -267,9 +236,8 @@ def response(rise, first=740.3, noise=10, late=0, length=1016):
 
 def test_slow_rise_of_the_first_path_and_late_energy_are_features():
     steep, slow, echo = (response_features(one, 740.3) for one in (response(1), response(6), response(1, late=6000)))
-    assert slow[1] - steep[1] == 5
+    assert (slow[1], echo[1]) == (steep[1] + 5, steep[1])
     assert echo[0] > steep[0] + 5
-    assert echo[1] == steep[1]
 
 
 @pytest.mark.parametrize(
@@ -332,7 +300,6 @@ def test_from_a_recording_to_corrected_ranges(tmp_path):
         table = written.columns("corrected")
     ranges = calib.load_ranges(flight)
     # Before the first pose there are no true distances, and ranges are left out.
-    shares = table["tail_share"][np.isin(table["time_ns"], ranges.time_ns)]
+    shares, rise = table["tail_share"][np.isin(table["time_ns"], ranges.time_ns)], ranges.features[:, 1]
     np.testing.assert_allclose(shares, calib.load_calibration(known).apply(ranges).tail_share, atol=1e-9)
-    rise = ranges.features[:, 1]
     assert np.mean(shares[rise >= np.quantile(rise, 0.95)]) > 3 * np.mean(shares[rise <= np.median(rise)])

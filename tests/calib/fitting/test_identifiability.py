@@ -28,7 +28,6 @@ def test_sides_that_pairs_leave_undetermined_are_named(pairs, splits):
     found = calib.fit(among(ranges(1200), pairs))
     assert found.calibration.undetermined_splits == splits
     assert ("only ranges between" in " ".join(found.warnings[:1])) == bool(splits)
-    assert calib.Calibration.from_json(found.calibration.to_json()) == found.calibration
     split = [tag for sides in splits for tags in sides for tag in tags]
     assert [tag for tag, std in found.calibration.delays_std_ns.items() if np.isinf(std)] == sorted(split)
 
@@ -37,32 +36,30 @@ def test_ranges_between_two_sides_are_corrected_and_others_refused_by_name(tmp_p
     everything, judged = ranges(8000, noise_m=0.03), ranges(6000, noise_m=0.03, seed=2)
     known = calib.fit(among(everything, ACROSS)).calibration
     # By the definition of synthetic ranges: half of both delays, and the curve at the reference power.
-    at_reference = bias_m(1.0)
     for pair, one in known.pair_constants.items():
-        planted = at_reference - 0.5e-9 * SPEED_OF_LIGHT * sum(DELAYS_NS[tag] for tag in pair)
+        planted = bias_m(1.0) - 0.5e-9 * SPEED_OF_LIGHT * sum(DELAYS_NS[tag] for tag in pair)
         assert abs(one.offset_m - planted) < 3 * one.std_m < 0.02
-    assert abs(np.median(known.apply(among(judged, ACROSS)).corrected_m - among(judged, ACROSS).truth_m)) < 0.01
-    assert calib.evaluate(among(judged, ACROSS), known).overall.inside_95 == pytest.approx(0.95, abs=0.04)
+    across = among(judged, ACROSS)
+    found = calib.evaluate(across, known).overall
+    assert abs(found.full.median_m) < 0.01
+    assert found.inside_95 == pytest.approx(0.95, abs=0.04)
     said = r"ranges of 1-2, 3-7: only ranges between tags 1, 2 and tags 3, 7 are"
-    with pytest.raises(calib.BadInputError, match=said):
-        known.apply(judged)
-    with pytest.raises(calib.BadInputError, match="ranges of 1-2: "):
-        calib.evaluate(among(judged, [(1, 2)]), known)
     with pytest.warns(calib.errors.LeftOutWarning, match=said) as caught:
         left = calib.evaluate(judged, known)
-    assert f"{len(judged) - len(among(judged, ACROSS))} of {len(judged)} ranges are left out" in str(caught[0].message)
-    assert left.overall == calib.evaluate(among(judged, ACROSS), known).overall
-    with pytest.raises(calib.BadInputError, match="`to`: the data do not determine the delay of tag 1, 2, 3, 7"):
-        calib.export(known, "registers")
+    assert f"{len(judged) - len(across)} of {len(judged)} ranges are left out" in str(caught[0].message)
+    assert left.overall == found
+
     assert "pair     1-3  ranges" in "\n".join(delay_lines(known))
-    assert calib.Calibration.from_json(known.to_json()) == known
-    assert '"schema_version": 5' in known.to_json()
     yaml_text = yaml.safe_load(calib.export(known, "ros-yaml"))["uwb_calibration"]
     assert yaml_text["undetermined_splits"] == [[[1, 2], [3, 7]]]
     assert "tx_antenna_delay" not in str(yaml_text["tags"])
-    wrong = known.to_json().replace("[1, 2]", "[1, 9]").replace("[1, 2, 3, 7]", "[1, 2, 3, 7]")
-    with pytest.raises(calib.BadInputError, match="undetermined_splits: expected calibrated tags, each one once"):
-        calib.Calibration.from_json(wrong)
+    for use, words in (
+        (lambda: known.apply(judged), said),
+        (lambda: calib.evaluate(among(judged, [(1, 2)]), known), "ranges of 1-2: "),
+        (lambda: calib.export(known, "registers"), "`to`: the data do not determine the delay of tag 1, 2, 3, 7"),
+    ):
+        with pytest.raises(calib.BadInputError, match=words):
+            use()
 
 
 @pytest.mark.parametrize("pairs", [[(1, 2)], [(1, 3), (1, 7), (2, 3), (2, 7)]], ids=["a pair", "sides"])
@@ -121,10 +118,9 @@ def among(r, pairs):
 @pytest.mark.parametrize("loss", ["mixture", "cauchy"])
 def test_delays_of_bipartite_pairs_are_the_smallest(loss):
     """Variable clock skews, as on real boards, must not determine the free direction, to a hundred nanoseconds."""
-    r = ranges(8000)
+    r = among(ranges(8000), ACROSS)
     skew = np.random.default_rng(2).normal(0, 1e-6, len(r))
-    r = replace(r, weight_target=0.5 * (1 + skew))[np.isin(r.initiator, [1, 2]) & np.isin(r.target, [3, 7])]
-    delays = calib.fit(r, loss=loss).calibration.delays_ns
+    delays = calib.fit(replace(r, weight_target=0.5 * (1 + skew)), loss=loss).calibration.delays_ns
     assert delays[1] + delays[2] == pytest.approx(delays[3] + delays[7], abs=0.01)
 
 

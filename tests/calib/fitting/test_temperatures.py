@@ -13,7 +13,7 @@ import pytest
 import calib
 import uwblink
 from benchmarks.directions import Recipe, flight
-from calib.calibration import held_out_line, patterns
+from calib.calibration import patterns
 from calib.data.ranges import read_c
 from tests.calib import overhearing
 from tests.processes import refuse, run
@@ -51,8 +51,8 @@ def test_planted_slopes_are_found_within_their_intervals(mm_per_k, apart, patter
     assert [one.tags for one in slopes] == ([(1,), (2,), (3,), (4,)] if apart else [(1, 2, 3, 4)])
     for one in slopes:
         # 3600 ranges with 5 cm of noise over 15 K determine a common slope to 0.15 mm/K, and that of each tag to 0.6.
-        assert one.std_m_per_k < (0.0007 if apart else 0.0002)
-        assert abs(one.m_per_k - 1e-3 * planted[one.tags[0]]) < 3 * one.std_m_per_k
+        most = 0.0007 if apart else 0.0002
+        assert abs(one.m_per_k - 1e-3 * planted[one.tags[0]]) / 3 < one.std_m_per_k < most
 
 
 @pytest.mark.parametrize(
@@ -116,24 +116,13 @@ def test_a_range_is_corrected_by_two_temperatures_and_says_what_is_missing_witho
     assert one - other == pytest.approx(slope.m_per_k, abs=1e-6)
 
 
-def test_files_keep_slopes_and_older_programs_refuse_them():
-    known = fitted(WARM, 3)
-    text = known.to_json()
-    assert (calib.Calibration.from_json(text), json.loads(text)["schema_version"]) == (known, 7)
-    with pytest.raises(calib.BadInputError, match=r"here: temperatures.*span_c"):
-        calib.Calibration.from_json(text.replace('"span_c": [', '"span_c": [-500, '), "here")
-    table = json.loads(text)
-    table["temperatures"][0]["span_c"].reverse()
-    with pytest.raises(calib.BadInputError, match="span_c: expected the lowest before the highest"):
-        calib.Calibration.from_json(json.dumps(table), "here")
+def test_temperatures_that_are_no_degrees_of_both_ends_are_refused():
     for celsius, said in (
         (25.0, "1, expected those of initiator"),
         ((300.0, 25.0), "300, expected degrees"),
     ):
         with pytest.raises(calib.BadInputError, match=f"`temperature_c`: found {said}"):
-            known.correct(3.0, -85.0, -86.0, 1, 2, temperature_c=celsius)
-    with pytest.raises(calib.BadInputError, match="slopes over temperature"):
-        calib.export(known, "ros-yaml")
+            fitted(WARM, 3).correct(3.0, -85.0, -86.0, 1, 2, temperature_c=celsius)
 
 
 def test_delays_are_compared_at_one_temperature_or_not_at_all(tmp_path):
@@ -161,21 +150,6 @@ def test_an_added_tag_shares_the_slope_of_the_others():
     assert added.temperatures == (replace(slope, tags=(2, 3, 4, 1)),)
     # At 35 to 50 degrees, 15 K above the reference: without the slope, the delay would be 0.5 ns shorter.
     assert added.delays_ns[1] == pytest.approx(whole.delays_ns[1], abs=0.06)
-
-
-@pytest.mark.parametrize(
-    ("broken", "why"),
-    [
-        ({"drift": {}}, "provenance: drift"),
-        ({"drift": {"sessions": 2, "days": "x", "m2_per_day": [0, 1, 2], "told": 1, "by_age": 1}}, "provenance: drift"),
-    ],
-)
-def test_faulty_provenance_is_refused_in_a_line(tmp_path, broken, why):
-    table = json.loads(fitted(WARM, 3).to_json())
-    (tmp_path / "c.json").write_text(json.dumps(table | {"provenance": table["provenance"] | broken}))
-    refuse("calib", "show", tmp_path / "c.json", naming=[why])
-    with pytest.raises(calib.BadInputError, match="provenance: held_out"):
-        held_out_line(replace(fitted(WARM, 3), provenance={"held_out": broken}))
 
 
 def test_temperatures_lie_between_readings_and_end_half_a_minute_after_the_last():
