@@ -8,6 +8,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.data.ranges import Ranges
 
@@ -58,19 +59,16 @@ def ranges_with_field(  # noqa: PLR0913 - what a world may differ in
     first, second = pairs[rng.integers(0, len(pairs), count)].T
     places = swum(rng, bodies, time)
     arm, turning = rng.normal(0, 0.15, (tags + 1, 3)), rng.uniform(0.3, 0.9, bodies)
-    ends = []
-    for ids in (first, second):
-        body = (ids - 1) // 2
-        angle = turning[body] * time
-        c, s = np.cos(angle), np.sin(angle)
-        x, y, z = arm[ids].T
-        ends.append(places[body, np.arange(count)] + np.column_stack([c * x - s * y, s * x + c * y, z]))
+    both = np.array([first, second])
+    body = (both - 1) // 2
+    turned = Rotation.from_rotvec((turning[body] * time).reshape(-1, 1) * [0, 0, 1]).apply(arm[both].reshape(-1, 3))
+    ends = places[body, np.arange(count)] + turned.reshape(2, count, 3)
     truth = np.linalg.norm(ends[0] - ends[1], axis=1)
     powers = -80 - 20 * np.log10(truth / 3) + rng.normal(0, 2.5, (2, count))
     error = 0.05 * np.sin(1.5 * np.mean(10 ** ((powers + 82) / 10), axis=0)) + noise_m * rng.normal(size=count)
     error += np.where(rng.random(count) < reflected, rng.exponential(0.3, count), 0.0)
     for a, b in combinations(range(bodies), 2):
-        rows = ((first - 1) // 2 == a) & ((second - 1) // 2 == b)
+        rows = (body[0] == a) & (body[1] == b)
         error[rows] += between_m * rng.normal() + field(rng, ends[0][rows], ends[1][rows], field_m, wave_m)
     swap = rng.random(count) < 0.5
     made = Ranges.from_arrays(
