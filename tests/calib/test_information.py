@@ -12,9 +12,9 @@ from calib.spread import radius_95
 DELAYS = [InformationColumn("delay", str(tag)) for tag in range(1, 5)]
 
 
-def from_rows(rows, weight=1e4):
+def from_rows(rows):
     rows = np.array(rows, dtype=float)
-    return weight * rows.T @ rows
+    return 1e4 * rows.T @ rows
 
 
 def ring(*, closed=True):
@@ -109,13 +109,11 @@ def test_one_and_two_kinds_of_detour_are_exponentials(share):
     assert long.square * DETOUR**2 == pytest.approx(sum(share * mean**2 for share, mean in parts))
     # Mean and variance of the noise follow from slope and curvature of the density (Tweedie's formula).
     step = 1e-4
-    logs = [
+    before, here, after = (
         np.log(densities(e[:200] + k * step, np.full(200, SIGMA), LEAST, DETOUR, long).reflected) for k in (-1, 0, 1)
-    ]
-    np.testing.assert_allclose(
-        found.noise_m()[:200], -(SIGMA**2) * (logs[2] - logs[0]) / (2 * step), rtol=1e-4, atol=1e-7
     )
-    bend = (logs[2] - 2 * logs[1] + logs[0]) / step**2
+    slope, bend = (after - before) / (2 * step), (after - 2 * here + before) / step**2
+    np.testing.assert_allclose(found.noise_m()[:200], -(SIGMA**2) * slope, rtol=1e-4, atol=1e-7)
     np.testing.assert_allclose(found.noise_var()[:200], 1 + SIGMA**2 * bend, rtol=1e-3, atol=1e-4)
 
 
@@ -144,13 +142,11 @@ def test_the_density_is_one():
 @pytest.mark.parametrize("error", [-0.15, 0.0, 0.1, 0.6, 3.0])
 @pytest.mark.parametrize("name", ["residual", *SHAPE])
 def test_slopes_are_derivatives(error, name):
-    step = 1e-5
-
     def at(moved):
         changed = {name: SHAPE[name] + moved} if name in SHAPE else {}
         return slopes(error + moved * (name == "residual"), **changed).log_density[0]
 
-    assert slopes(error).by[name][0] == pytest.approx((at(step) - at(-step)) / (2 * step), rel=1e-4, abs=1e-5)
+    assert slopes(error).by[name][0] == pytest.approx((at(1e-5) - at(-1e-5)) / 2e-5, rel=1e-4, abs=1e-5)
 
 
 # Radii that contain 95 % of values.

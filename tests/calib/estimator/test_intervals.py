@@ -31,20 +31,17 @@ def test_least_squares_of_delays_alone_and_its_variances_agree_with_numpy():
     )
     error = model.ranges.raw_m - model.ranges.truth_m
     found = known_distances.robust_fit(model, error, "l2", None, ("delay",))
-    delays = found.optimum.layout.indices(["delay"])
     cut = time_blocks(model.ranges.time_ns, model.ranges.session)
-    kept = {"delay": Kept.delays(delays, 1e9, model.held)}
+    kept = {"delay": Kept.delays(found.optimum.layout.indices(["delay"]), 1e9, model.held)}
     whole, lasting = sandwich(Slopes(found.rows, found.optimum, cut), kept)["delay"]
     # With NumPy alone: scores summed by block, the residual's share of the degrees of freedom, and the persistence of
     # errors.
-    tags, ranges = np.array(model.tags), model.ranges
-    weights = ((ranges.initiator, ranges.weight_initiator), (ranges.target, ranges.weight_target))
-    matrix = sum((ids[:, None] == tags) * weight[:, None] for ids, weight in weights) * 0.299702547
+    matrix = synthetic.design(model.ranges, model.tags)
     np.testing.assert_allclose(found.optimum.of("delay"), -np.linalg.lstsq(matrix, error)[0], atol=2e-6)
     scores = matrix * found.residuals[:, None]
     sums = np.array([scores[cut.number == k].sum(axis=0) for k in range(cut.count)])
     inverse = np.linalg.inv(matrix.T @ matrix)
-    plain = inverse @ sums.T @ sums @ inverse * len(ranges) / (len(ranges) - len(tags))
+    plain = inverse @ sums.T @ sums @ inverse * 400 / (400 - len(model.tags))
     np.testing.assert_allclose(
         whole, plain * lasting.factor * (stats.t.ppf(0.975, lasting.freedom) / 1.959964) ** 2, rtol=2e-3
     )
@@ -52,13 +49,16 @@ def test_least_squares_of_delays_alone_and_its_variances_agree_with_numpy():
 
 @pytest.mark.slow
 def test_reflections_covariance_of_other_detours_are_in_the_intervals(monkeypatch):
-    recipes = [Recipe(share=(share, share), seconds=60) for share in (0.001, 0.3)]
-    whole = [np.trace(fitted(recipe).covariances["delay"]) for recipe in recipes]
+    def variances():
+        recipes = (Recipe(share=(share, share), seconds=60) for share in (0.001, 0.3))
+        return np.array([np.trace(fitted(recipe).covariances["delay"]) for recipe in recipes])
+
+    whole = variances()
     monkeypatch.setattr(known_distances, "_covariance_of_other_detours", lambda *_: 0.0)
-    without = [np.trace(fitted(recipe).covariances["delay"]) for recipe in recipes]
-    few, many = np.subtract(whole, without)
-    assert few >= 0
-    assert many > max(20 * few, 2e-8, 0.1 * without[1])
+    without = variances()
+    few, many = whole - without
+    assert 0 <= few < many / 20
+    assert many > max(2e-8, 0.1 * without[1])
 
 
 def test_offsets_of_pairs_are_fitted_if_they_are_identifiable():
@@ -83,8 +83,8 @@ def test_times_in_microseconds_for_nanoseconds_do_not_narrow_intervals():
     some = synthetic.ranges(n=600)
     sound, hasty = (calib.fit(replace(some, time_ns=some.time_ns // factor)) for factor in (1, 1000))
     # Thirty blocks determine a variance to a quarter; one block, as with three milliseconds, left a third of the width.
-    widths = [np.mean(list(found.calibration.delays_std_ns.values())) for found in (sound, hasty)]
-    assert widths[1] > 0.75 * widths[0]
+    wide, narrow = (np.mean(list(found.calibration.delays_std_ns.values())) for found in (sound, hasty))
+    assert narrow > 0.75 * wide
     assert [said for said in hasty.warnings if "s of data" in said]
 
 
@@ -94,8 +94,8 @@ def blocks(count, seconds):
 
 def walk(keep, share, rng, blocks=800, columns=4):
     """Return noise of which a share is persistent, with the resulting factor on the variance of a mean."""
-    steps = np.sqrt(1 - keep**2) * rng.normal(size=(blocks, columns))
-    steps[0] = rng.normal(size=columns)
+    steps = rng.normal(size=(blocks, columns))
+    steps[1:] *= np.sqrt(1 - keep**2)
     memory = signal.lfilter([1.0], [1.0, -keep], steps, axis=0)
     series = np.sqrt(share) * memory + np.sqrt(1 - share) * rng.normal(size=(blocks, columns))
     return series - series.mean(axis=0), 1 + 2 * share * keep / (1 - keep)
@@ -114,7 +114,7 @@ def test_a_short_recording_has_few_degrees_of_freedom():
     rng = np.random.default_rng(2)
     few = persistence(walk(0.95, 1.0, rng, blocks=120)[0], blocks(120, 12.0), 3)
     many = persistence(walk(0.6, 1.0, rng, blocks=1000)[0], blocks(1000, 100.0), 3)
-    assert few.freedom < many.freedom
+    # Fewer degrees of freedom have a larger factor.
     assert students_factor(few.freedom) > students_factor(many.freedom) > 0.995
     assert few.stretches < 20 < many.stretches
 
@@ -122,8 +122,8 @@ def test_a_short_recording_has_few_degrees_of_freedom():
 def test_blocks_are_short_and_leave_gaps_out():
     time = np.concatenate([np.arange(0, 10, 0.01), np.arange(1000, 1010, 0.01)]) * 1e9
     found = time_blocks(time.astype(np.int64), np.zeros(len(time), dtype=np.int32))
-    assert set(np.diff(found.number).tolist()) <= {0, 1}
-    assert found.number[999] < found.number[1000]
+    steps = np.diff(found.number).tolist()
+    assert (set(steps), steps[999]) == ({0, 1}, 1)
     assert found.seconds == pytest.approx(19.98)
     # Blocks have a tenth of a second, however long the gap is.
     assert 199 <= found.count <= 202
@@ -145,15 +145,16 @@ def ranges_with_offsets(rng, pairs, delays_ns, offsets_m, noise_m, each=300):
     ends, true_m = pairs[pair], rng.uniform(1, 6, len(pair))
     constant_m = offsets_m - 0.5 * LIGHT_M_PER_NS * delays_ns[pairs].sum(axis=1)
     error_m = constant_m[pair] + noise_m[pair] * rng.normal(size=len(pair))
-    columns: Any = {"fpp1_dbm": rng.uniform(-92, -80, len(pair)), "time_ns": np.arange(len(pair)) * 10_000_000}
-    initiator, target = ends.T + 1
-    ranges = calib.Ranges.from_arrays(true_m + error_m, initiator=initiator, target=target, truth_m=true_m, **columns)
+    ranges = calib.Ranges.from_arrays(
+        true_m + error_m, initiator=ends[:, 0] + 1, target=ends[:, 1] + 1, truth_m=true_m,
+        fpp1_dbm=rng.uniform(-92, -80, len(pair)), time_ns=np.arange(len(pair)) * 10_000_000,
+    )  # fmt: skip
     return ranges, np.bincount(pair, error_m) / each
 
 
 @pytest.mark.parametrize("count", [3, 4, 6])
 def test_offsets_of_few_pairs_widen_intervals_as_in_regression(count):
-    rng, light = np.random.default_rng(count), LIGHT_M_PER_NS
+    rng = np.random.default_rng(count)
     pairs = np.array(list(combinations(range(count), 2)))
     delays, offsets = rng.normal(0, 0.3, count), rng.normal(0, 0.03, len(pairs))
     ranges, mean_m = ranges_with_offsets(rng, pairs, delays, offsets, np.full(len(pairs), 0.02))
@@ -165,7 +166,7 @@ def test_offsets_of_few_pairs_widen_intervals_as_in_regression(count):
         assert "by up to 202 ps" in seen[0]
         return
     # Means of pairs are a regression with delays as coefficients; their common part is the constant of the curve.
-    rows = -0.5 * light * (pairs[:, :, None] == np.arange(count)).any(axis=1)
+    rows = -0.5 * LIGHT_M_PER_NS * (pairs[:, :, None] == np.arange(count)).any(axis=1)
     (_, (squares,), *_), apart = np.linalg.lstsq(rows, mean_m), np.eye(count) - 1 / count
     covariance = apart @ np.linalg.inv(rows.T @ rows) @ apart * squares / freedom
     mine = apart @ result.calibration.covariance_ns2(range(1, count + 1)) @ apart
@@ -235,10 +236,10 @@ def sampled(information, slope, typical, rng):
 def test_variances_are_means_of_their_posterior(planted_m):
     rng = np.random.default_rng(5)
     information = rng.uniform(300, 3000, 8)
-    values = rng.normal(0, np.hypot(planted_m, information**-0.5))
-    found = mean_variance(information, values * information, 0.035, BOUNDS)
+    slope = information * rng.normal(0, np.hypot(planted_m, information**-0.5))
     # Sampling has an error of 1 % of the mean, the grid of 200 deviations less.
-    assert found == pytest.approx(sampled(information, values * information, 0.035, rng), rel=0.03)
+    expected = pytest.approx(sampled(information, slope, 0.035, rng), rel=0.03)
+    assert mean_variance(information, slope, 0.035, BOUNDS) == expected
     # Without information it is the typical variance.
     assert mean_variance(np.zeros(4), np.zeros(4), 0.035, BOUNDS) == pytest.approx(0.035**2, rel=0.01)
 
@@ -285,9 +286,12 @@ def starloc():
         range_m, initiator, target, fpp1, fpp2, truth_m, time_s = (
             np.array([float(row[key]) for row in rows]) for key in names
         )
-        ids: Any = {"initiator": initiator.astype(int), "target": target.astype(int)}
-        known: Any = {"truth_m": truth_m, "time_ns": (1e9 * time_s).astype(np.int64)}
-        flights.append(calib.Ranges.from_arrays(range_m, **ids, fpp1_dbm=fpp1, fpp2_dbm=fpp2, **known))
+        flights.append(
+            calib.Ranges.from_arrays(
+                range_m, initiator=initiator.astype(int), target=target.astype(int), fpp1_dbm=fpp1, fpp2_dbm=fpp2,
+                truth_m=truth_m, time_ns=(1e9 * time_s).astype(np.int64),
+            )
+        )  # fmt: skip
     return flights
 
 

@@ -23,10 +23,9 @@ def test_an_arrow_is_inverted_as_the_dense_matrix_is():
     free = np.flatnonzero(np.arange(107) != 50)
     found, dense = inverse.inverse_of(matrix, free), inverse.inverse_of(matrix.toarray(), free)
     assert isinstance(found, inverse.SparseInverse)
-    assert found[:, :] == pytest.approx(dense, rel=1e-6, abs=1e-9)
-    assert found[3:9, 3:9] == pytest.approx(dense[3:9, 3:9], rel=1e-6, abs=1e-9)
     right = rng.normal(size=(107, 2))
-    assert found @ right == pytest.approx(dense @ right, rel=1e-6, abs=1e-9)
+    for one, other in ((found[:, :], dense), (found[3:9, 3:9], dense[3:9, 3:9]), (found @ right, dense @ right)):
+        assert one == pytest.approx(other, rel=1e-6, abs=1e-9)
     assert inverse.trace_of_product(found, matrix) == pytest.approx(106, rel=1e-2)
 
 
@@ -57,11 +56,8 @@ def test_a_search_finds_the_power_of_units_of_a_prior(most, monkeypatch):
     rng, names = np.random.default_rng(2), ("",) * 400
     unit = rng.normal(0, 1, 400)
     seen = 0.5 * np.exp(0.6 * (unit - unit.mean())) * rng.normal(size=400) + rng.normal(0, 0.1, 400)
-    blocks = (
-        unknowns.Unknown(kind="unit", names=names, start=unit, known=np.ones(400, dtype=bool)),
-        grouped_errors.scattered("offset", names, (0.1, 1e-3, 10.0), unit="unit"),
-    )
-    layout = unknowns.Layout(blocks)
+    units = unknowns.Unknown(kind="unit", names=names, start=unit, known=np.ones(400, dtype=bool))
+    layout = unknowns.Layout((units, grouped_errors.scattered("offset", names, (0.1, 1e-3, 10.0), unit="unit")))
     every = NormalRows(
         value=seen, std=np.full(400, 0.1), entries=np.ones((400, 1)), columns=400 + np.arange(400)[:, None]
     )
@@ -96,8 +92,7 @@ def test_a_search_ends_at_one_optimum_of_unknowns_and_weights(data):
         # Starts differ by a standard error, in logarithms by a half at most: farther away, there may be other optima.
         away = np.minimum(np.sqrt(np.diag(np.asarray(optimum.covariance))), 0.5) * rng.normal(size=len(optimum.x))
         again = maximize(rows, unknowns.Priors(optimum.layout, weights), optimum.x + away, asked=asked)
-        assert again.success
-        assert again.steps < 25
+        assert (again.success, again.steps < 25) == (True, True)
         # A search ends if a step gains less than 0.01 in log likelihood, at most a tenth of a standard error, for both
         # searches.
         assert np.abs((again.of("delay") - optimum.of("delay")) / std).max() < 0.2
@@ -121,15 +116,15 @@ def mixed(n=40_000, share=0.12, mean_m=0.35, outlier=0.0, seed=3):
     ids=["one kind", "outliers", "no reflections", "long detours"],
 )
 def test_the_parts_of_errors_are_found(planted):
-    found = grouped_errors.fit_grouped_errors(mixed(**planted))
+    found, sound = grouped_errors.fit_grouped_errors(mixed(**planted)), "outlier" not in planted
+    share = planted.get("share", 0.12)
     # 20,000 errors determine the centre to 0.6 and 1.2 mm and a sigma to 0.5 %; three times that are allowed.
     np.testing.assert_allclose(found.centre_m, [0.03, 1.0], atol=0.0035)
     np.testing.assert_allclose(found.sigma_m, [0.06, 0.12], rtol=0.02)
-    share = planted.get("share", 0.12)
-    np.testing.assert_allclose(found.reflected, share, atol=0.012 if "outlier" not in planted else 0.02)
+    np.testing.assert_allclose(found.reflected, share, atol=0.012 if sound else 0.02)
     # Planted outliers are spread over 80 m, those of the model over 10 m.
     np.testing.assert_allclose(found.outliers, planted.get("outlier", 0.0), atol=0.012)
-    if share and "outlier" not in planted:
+    if share and sound:
         np.testing.assert_allclose(found.detour_m, planted.get("mean_m", 0.35), rtol=0.06)
     assert (found.centre_m - [0.03, 1.0]) / found.centre_std_m == pytest.approx([0, 0], abs=3)
 
