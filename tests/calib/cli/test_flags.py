@@ -3,6 +3,7 @@
 import copy
 import json
 import operator
+import re
 from dataclasses import fields
 from functools import reduce
 
@@ -17,7 +18,7 @@ from calib.settings import FitSettings, read_distances
 from tests import processes
 from tests.calib.plain_tables import DELAYS_NS, Plan, bias_m, write
 from tests.calib.trajectories.sines import flight
-from uwblink import Contents, KnownDistance, Recording
+from uwblink import Contents, KnownDistance, load
 
 
 def test_other_text_is_not_changed():
@@ -53,8 +54,7 @@ def test_a_fit_repeats_its_settings(tmp_path):
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    path = tmp_path_factory.mktemp("flight") / "f.uwb"
-    flown = flight(seconds=5.0)
+    path, flown = tmp_path_factory.mktemp("flight") / "f.uwb", flight(seconds=5.0)
     Contents(exchanges=flown.exchanges, poses=flown.poses, tags=flown.tags).save(path)
     return path
 
@@ -63,10 +63,8 @@ def recording(tmp_path_factory):
 def test_known_positions_at_the_start_are_enough(recording, tmp_path):
     words = ("--truth", "ranges", "--poses-until", 4, "-o", tmp_path / "c.json")
     assert processes.succeed("calib", "fit", recording, *words).stdout.count(" delay ") == 6
-    written = json.loads((tmp_path / "c.json").read_text())
-    assert written["provenance"]["truth"] == "ranges"
-    with Recording.open(recording) as opened:
-        assert written["provenance"]["exchanges"] <= len(opened.exchanges())
+    written = json.loads((tmp_path / "c.json").read_text())["provenance"]
+    assert (written["truth"], written["exchanges"] <= len(load(recording).exchanges)) == ("ranges", True)
 
 
 @pytest.mark.parametrize(
@@ -128,10 +126,9 @@ def run(folder, line):
 def test_import_curve_localization(folder, fitted):
     assert "ranges without stamps" in fitted.stderr
     written = json.loads((folder / "c.json").read_text())
-    middle = sum(written["delays_ns"][str(tag)] - delay for tag, delay in DELAYS_NS.items()) / len(DELAYS_NS)
+    shift = np.array([written["delays_ns"][str(tag)] - delay for tag, delay in DELAYS_NS.items()])
     # Delays are stated for a curve that is zero at -82 dBm, so all are shifted equally.
-    expected = {str(tag): pytest.approx(delay + middle, abs=0.05) for tag, delay in DELAYS_NS.items()}
-    assert written["delays_ns"] == expected
+    assert shift == pytest.approx(np.full(len(written["delays_ns"]), shift.mean()), abs=0.05)
     assert any("ranges without stamps" in warning for warning in written["provenance"]["warnings"])
     assert "ranges without stamps" in run(folder, "calib show c.json").stdout
     located = json.loads(run(folder, "calib localize part.uwb -c c.json --seeds 1 --json").stdout)["summary"]["rmse_m"]
@@ -147,21 +144,21 @@ def test_import_curve_localization(folder, fitted):
 @pytest.mark.usefixtures("fitted")
 def test_constants_of_pairs_by_commands(folder):
     done = run(folder, "calib fit ranges.uwb -o p.json --constants pair --delays-only")
-    assert "pair    1-11" in done.stdout
     assert "delays only" in done.stderr
-    assert "constants of 12 pairs" in run(folder, "calib show p.json").stdout
-    assert "between pairs" in run(folder, "calib evaluate ranges.uwb -c p.json").stdout
     run(folder, "calib fit ranges.uwb -o q.json --delays-from c.json")
-    shown = run(folder, "calib show q.json").stdout
-    assert "fitted: curve only" in shown
-    assert "warning: curve only" in shown
+    for text, said in (
+        (done.stdout, "pair    1-11"),
+        (run(folder, "calib show p.json").stdout, "constants of 12 pairs"),
+        (run(folder, "calib evaluate ranges.uwb -c p.json").stdout, "between pairs"),
+        (run(folder, "calib show q.json").stdout, r"(?s)fitted: curve only.*warning: curve only"),
+    ):
+        assert re.search(said, text)
 
 
 def test_one_pair_is_evaluated_without_a_number_between_pairs(folder):
     run(folder, "calib fit one.uwb -o one.json --constants pair --delays-only")
     told = run(folder, "calib evaluate one.uwb -c one.json").stdout
-    assert "are within pairs" in told
-    assert "nan" not in told
+    assert ["are within pairs" in told, "nan" in told] == [True, False]
 
 
 # A fit that stopped before it converged is marked as such wherever its calibration is used, and exits with status 1.
@@ -172,15 +169,15 @@ def stopped(monkeypatch, tmp_path):
     """Return the output of a command that stops before it converges and writes c.json."""
     calib.sample_flight().save(tmp_path / "f.uwb")
     monkeypatch.setattr(optimize, "MOST_STEPS", 2)
-    return processes.run(*["calib", "fit", "f.uwb", "-o", "c.json"], cwd=tmp_path)
+    return processes.run("calib", "fit", "f.uwb", "-o", "c.json", cwd=tmp_path)
 
 
 def test_stopped_fits_are_marked_and_have_status_1(stopped, tmp_path):
+    as_json = processes.run("calib", "fit", "f.uwb", "-o", "d.json", "--json", cwd=tmp_path)
+    assert (stopped.returncode, as_json.returncode) == (1, 1)
     assert "stopped after" in stopped.stdout
     assert "before it converged" in stopped.stderr
     assert "NOT CONVERGED" in repr(calib.load_calibration(tmp_path / "c.json"))
-    as_json = processes.run(*["calib", "fit", "f.uwb", "-o", "d.json", "--json"], cwd=tmp_path)
-    assert (stopped.returncode, as_json.returncode) == (1, 1)
     for text in ((tmp_path / "c.json").read_text(), as_json.stdout):
         assert json.loads(text)["provenance"]["converged"] is False
 
@@ -239,11 +236,12 @@ def test_calibrations_of_version_0_2_are_read_by_the_old_names_of_keys(document)
     older = {"geometry": "rests_on", "undetermined_text": "left_open"}
     provenance = {older.get(key, key): value for key, value in document["provenance"].items()}
     assert "rests_on" in provenance
-    known = calib.Calibration.from_json(json.dumps(document | {"provenance": provenance}))
-    assert known == calib.Calibration.from_json(json.dumps(document))
+    old, new = (
+        calib.Calibration.from_json(json.dumps(one)) for one in (document | {"provenance": provenance}, document)
+    )
+    assert old == new
 
 
 def test_flat_curves_are_shown_at_one_power(document):
     text = repr(calib.Calibration.from_json(json.dumps(document)))
-    (line,) = [line for line in text.splitlines() if line.startswith("  lifted power")]
-    assert len(line.removeprefix("  lifted power").split()) == 1
+    assert re.findall(r"(?m)^  lifted power +\S+$", text)
