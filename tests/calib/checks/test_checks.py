@@ -48,8 +48,7 @@ def test_checks_that_involve_chance_share_one_budget_and_the_page_shows_them_all
     assert sum(FIT_LEVELS.values()) == pytest.approx(OF_A_FIT)
     told = Counter(fault for check in CHECKS for fault in check.remedies)
     assert max(told.values()) == 1
-    page = checks.reference()
-    assert all(f"**{fault}**: " in page for fault in told)
+    assert all(f"**{fault}**: " in checks.reference() for fault in told)
     assert set(IMPLIED).union(*IMPLIED.values(), *(case.expected for case in planted.FAULTS)) <= told.keys()
 
 
@@ -75,15 +74,13 @@ def test_the_command_prints_findings_clocks_and_p_values(tmp_path):
     save(fly(plan, 91, 5), tmp_path / "sound.uwb")
     save(planted.doubled(planted.stepped(fly(plan, 92, 5), RNG(1)), RNG(2)), tmp_path / "wrong.uwb")
     shown = processes.succeed("calib", "doctor", "sound.uwb", cwd=tmp_path).stdout
-    assert "nothing found" in shown
-    assert shown.count("pair 10-20: ") == 1
+    assert [shown.count(text) for text in ("nothing found", "pair 10-20: ")] == [1, 1]
     assert "same sign" in shown
     said = processes.run("calib", "doctor", "sound.uwb", "wrong.uwb", "--json", cwd=tmp_path)
     assert said.stderr == ""
     told = json.loads(said.stdout)
     found = {one["fault"]: one["p_value"] for one in told["findings"]}
-    assert found["doubled exchanges"] == 0
-    assert 0 < found["delay changed mid-flight"] < FINDING_LEVEL
+    assert 0 == found["doubled exchanges"] < found["delay changed mid-flight"] < FINDING_LEVEL
     assert all("wrong.uwb: " in one["evidence"] for one in told["findings"] if "between" not in one["fault"])
     skews, _ = told["clock_skews"].values()
     assert len(skews) == 12
@@ -204,7 +201,6 @@ def test_a_fit_in_a_room_converges():
 # Warnings of fits: no wrong delay without a warning, and no warning in sound worlds.
 
 
-TAGS = {"four": 4, "six": 6}
 REFUSED = {
     "truth in millimetres": "millimetres",
     "truth in feet": "feet",
@@ -233,14 +229,13 @@ NAMED = {
 
 def world_with(name):
     seconds = 120.0 if name in NAMED else 60.0
-    tags = next((count for word, count in TAGS.items() if word in name), 5)
+    tags = 4 if "four" in name else 6 if "six" in name else 5
     return PLANTED[name](make(Recipe(tags=tags, seconds=seconds), 3))
 
 
 def wrong(world, found):
     """Return the errors of delays after a common shift, divided by their stated standard errors."""
-    error, std = about_their_mean(found.calibration, world.delays_ns)
-    return error / std
+    return np.divide(*about_their_mean(found.calibration, world.delays_ns))
 
 
 @pytest.mark.slow
@@ -286,17 +281,16 @@ def test_short_recordings_with_persistent_errors_have_a_warning():
 @pytest.mark.slow
 def test_intervals_cover_the_truth_if_errors_persist():
     worlds = [make(CLEAN["persistent 1 s, 2 cm over 3 s, 90 s"], seed) for seed in range(5)]
-    scores = [wrong(world, calib.fit(world.ranges)) for world in worlds]
     # Of 25 errors, 24 should be within two standard errors; with blocks of time of a fixed length it would be 16.
-    assert np.mean(np.abs(scores) < 1.96) > 0.85
+    assert np.mean(np.abs([wrong(world, calib.fit(world.ranges)) for world in worlds]) < 1.96) > 0.85
 
 
 def distances_late_by(ranges, seconds):
     """Return ranges with true distances of an earlier time, between the same two tags."""
     truth, time_s = ranges.truth_m.copy(), ranges.time_ns * 1e-9
-    pair = np.minimum(ranges.initiator, ranges.target) * 100 + np.maximum(ranges.initiator, ranges.target)
+    pair = np.sort(ranges.ends, axis=1) @ [100, 1]
     for one in np.unique(pair):
-        rows = np.flatnonzero(pair == one)
+        rows = pair == one
         truth[rows] = CubicSpline(time_s[rows], truth[rows])(time_s[rows] - seconds)
     return replace(ranges, truth_m=truth)
 
@@ -393,8 +387,7 @@ def test_sound_recordings_have_no_finding_and_the_examined_part_is_stated(path):
 def test_late_poses_are_found_with_their_delay(flight, tmp_path):
     late = replace(flight.poses, time_ns=flight.poses.time_ns + 400_000_000)
     (finding,) = calib.examine(save(replace(flight, poses=late), tmp_path / "late.uwb"))
-    assert finding.fault == "pose time offset"
-    assert "-0.400 s" in finding.evidence or "-0.39" in finding.evidence
+    assert (finding.fault, bool(re.search(r"-0\.(400 s|39)", finding.evidence))) == ("pose time offset", True)
 
 
 @pytest.mark.usefixtures("short_stretches")
