@@ -129,18 +129,20 @@ def batch(contents, t, ends, measured, start):
             turn[robot] = start[robot][1] * Rotation.from_rotvec(own[:, 3:6])
         off = p[:, 18:].reshape(count, 3, 6)
         found, row = np.empty((count, len(t))), 0
+
+        def ahead(robot, k, part):
+            """Return place and attitude of a robot some seconds after a reading."""
+            w, f = (read[robot, k] - off[:, robot]).reshape(count, 2, 3).swapaxes(0, 1)
+            at = place_m[robot] + speed[robot] * part + turn[robot].apply(f) * part**2 / 2
+            return at, turn[robot] * Rotation.from_rotvec(w * part)
+
         for k in range(read.shape[1] - 1):
             while row < len(t) and t[row] < (k + 1) * h - 1e-9:
-                part = t[row] - k * h
-                tip = []
-                for tag in ends[row].tolist():
-                    robot = (tag - 1) // 2
-                    w, f = (read[robot, k] - off[:, robot]).reshape(count, 2, 3).swapaxes(0, 1)
-                    here = place_m[robot] + speed[robot] * part + turn[robot].apply(f) * part**2 / 2
-                    tip.append(here + (turn[robot] * Rotation.from_rotvec(w * part)).apply(ARMS[tag]))
-                found[:, row] = np.linalg.norm(tip[0] - tip[1], axis=1)
+                last = [ahead(robot, k, t[row] - k * h) for robot in range(3)]
+                tips = [(*last[(tag - 1) // 2], ARMS[tag]) for tag in ends[row].tolist()]
+                one, other = (at + turned.apply(arm) for at, turned, arm in tips)
+                found[:, row] = np.linalg.norm(one - other, axis=1)
                 row += 1
-                last = k, part
             if row == len(t):
                 break
             for robot in range(3):
@@ -149,13 +151,9 @@ def batch(contents, t, ends, measured, start):
                 place_m[robot] += speed[robot] * h + force * h**2 / 2
                 speed[robot] += force * h
                 turn[robot] = turn[robot] * Rotation.from_rotvec(w * h)
-        k, part = last
-        for robot in range(3):
-            w, f = (read[robot, k] - off[:, robot]).reshape(count, 2, 3).swapaxes(0, 1)
-            place_m[robot] += speed[robot] * part + turn[robot].apply(f) * part**2 / 2
-            turn[robot] = turn[robot] * Rotation.from_rotvec(w * part)
-        where = [turn[0].inv().apply(place_m[robot] - place_m[0]) for robot in (1, 2)]
-        return found, where, [turn[0].inv() * turn[robot] for robot in (1, 2)]
+        (own, frame), *others = last
+        where = [frame.inv().apply(at - own) for at, _ in others]
+        return found, where, [frame.inv() * turned for _, turned in others]
 
     x, step = np.zeros(36), 1e-5
     for _ in range(5):
@@ -213,8 +211,7 @@ def test_relative_poses_of_three_quadcopters_are_consistent(known):
     """Three flights as in the paper, with seeds that were chosen before."""
     heard = [one for seed in (301, 302, 303) for one in calib.localize_team(simulated(seed, 12.0), known, LISTEN)]
     assert [(one.body, one.reference) for one in heard] == 3 * [("robot2", "robot1"), ("robot3", "robot1")]
-    found = team.team_json(heard)
-    figures, less = found["summary"], found["reduction_by_listening"]
+    figures, less = (team.team_json(heard)[key] for key in ("summary", "reduction_by_listening"))
     rmse_m = {name: one["rmse_m"] for name, one in figures.items()}
     # Ranges have 5 cm of noise, and baselines of half a metre determine directions over three metres.
     assert rmse_m["variance"] < min(0.2, rmse_m["raw"] / 2, rmse_m["dead reckoning"] / 20)
@@ -224,13 +221,11 @@ def test_relative_poses_of_three_quadcopters_are_consistent(known):
         assert 0.1 < less["ranges only"][name] < less["own ranges"][name] < 1
     for name in ("variance", "robust"):
         low, high = figures[name]["nees_bounds"]
-        assert low < figures[name]["nees"] < high
-        assert high - low < 2.5
+        assert low < figures[name]["nees"] < high < low + 2.5
     assert figures["raw"]["nees"] > 50
     assert figures["variance"]["accepted"] > 0.995
-    text = team.team_text(heard, LISTEN)
-    assert f"{figures['variance']['rmse_m']:.3f}" in text
-    assert "compared with ranges only: raw" in text
+    for said in (f"{figures['variance']['rmse_m']:.3f}", "compared with ranges only: raw"):
+        assert said in team.team_text(heard, LISTEN)
 
 
 @pytest.mark.slow
@@ -245,9 +240,8 @@ def test_poses_after_the_start_are_only_for_evaluation(known):
         np.testing.assert_array_equal([moved.estimate_m, blind.estimate_m], [seen.estimate_m] * 2)
         np.testing.assert_array_equal(seen.attitude, blind.attitude)
         assert len(seen.nis) == len(blind.nis) > 400
-        assert np.isnan(blind.truth_m[-1]).all()
+        assert (np.isnan(blind.truth_m[-1]).all(), np.isfinite(blind.rmse_m)) == (True, True)
         assert (moved.rmse_m > 1.0) == (body == 0)
-        assert np.isfinite(blind.rmse_m)
 
 
 @pytest.mark.slow
@@ -341,10 +335,10 @@ def test_an_option_of_another_model_is_refused(option, used_by, tmp_path):
 
 @pytest.mark.slow
 def test_the_command_prints_writes_and_refuses(known, tmp_path):
-    recording, document, flown = tmp_path / "three.uwb", tmp_path / "c.json", simulated(307, 1.0)
-    flown.save(recording)
-    known.save(document)
-    words = "calib", "localize", recording, "-c", document, "--model", "team"
+    flown = simulated(307, 1.0)
+    flown.save(tmp_path / "three.uwb")
+    known.save(tmp_path / "c.json")
+    words = "calib", "localize", tmp_path / "three.uwb", "-c", tmp_path / "c.json", "--model", "team"
     said = json.loads(processes.run(*words, "--use", "receptions", "--imu", "industrial", "--json").stdout)
     assert [(one["body"], one["reference"]) for one in said["bodies"]] == [("robot2", "robot1"), ("robot3", "robot1")]
     assert said["summary"]["dead reckoning"]["accepted"] is None
@@ -354,8 +348,9 @@ def test_the_command_prints_writes_and_refuses(known, tmp_path):
     assert "start: relative poses within 0.02 m, 1 deg and 0.05 m/s" in text
     assert "by overheard frames" not in text
     assert (tmp_path / "tum" / "three_uwb-robot2-from-robot1-dead-reckoning.tum").exists()
-    truth = np.loadtxt(tmp_path / "tum" / "three_uwb-robot3-from-robot1-truth.tum")
-    close = np.loadtxt(tmp_path / "tum" / "three_uwb-robot3-from-robot1-variance.tum")
+    truth, close = (
+        np.loadtxt(tmp_path / "tum" / f"three_uwb-robot3-from-robot1-{name}.tum") for name in ("truth", "variance")
+    )
     assert np.abs(truth[:, 1:4] - close[:, 1:4]).max() < 0.3
     assert np.abs(np.sum(truth[:, 4:] * close[:, 4:], axis=1)).min() > np.cos(np.radians(5) / 2)
     replace(flown, imu={}).save(tmp_path / "bare.uwb")
@@ -366,12 +361,10 @@ def test_the_command_prints_writes_and_refuses(known, tmp_path):
 
 @pytest.mark.slow
 def test_delays_that_a_calibration_has_wrong_within_its_errors_are_corrected_on_the_way():
-    off = np.array([0.4, -0.3, 0.5, 0.3, -0.4, 0.3])
-    known = replace(
-        PLANTED, delays_ns=dict(zip(ARMS, off.tolist(), strict=True)), delays_std_ns=dict.fromkeys(ARMS, 0.4)
-    )
+    off = dict(zip(ARMS, (0.4, -0.3, 0.5, 0.3, -0.4, 0.3), strict=True))
+    known = replace(PLANTED, delays_ns=off, delays_std_ns=dict.fromkeys(ARMS, 0.4))
     for found in calib.localize_team(flight(6.0), known, replace(CLOSE, online=True)):
         assert found.rmse_m["online"].mean() < 0.7 * found.rmse_m["variance"].mean()
         delay, std = np.array([*found.delays.values()]).T
         assert np.abs(delay / std).max() < 3.5
-        assert np.sum(delay**2) < 0.3 * np.sum(off**2)
+        assert np.sum(delay**2) < 0.3 * np.sum(np.square([*off.values()]))
