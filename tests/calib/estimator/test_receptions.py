@@ -182,6 +182,6 @@ def test_a_real_flight_has_narrower_intervals_and_the_same_delays(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_report_fits_receptions_as_well(tmp_path):
+def test_a_report_fits_receptions_as_well():
     data, _ = flight(7700, count=600)
     assert calib.run_campaign(data, use="receptions").calibration.provenance["arrivals"] > 1900

@@ -32,7 +32,7 @@ def test_sides_that_pairs_leave_undetermined_are_named(pairs, splits):
     assert [tag for tag, std in found.calibration.delays_std_ns.items() if np.isinf(std)] == sorted(split)
 
 
-def test_ranges_between_two_sides_are_corrected_and_others_refused_by_name(tmp_path):
+def test_ranges_between_two_sides_are_corrected_and_others_refused_by_name():
     everything, judged = ranges(8000, noise_m=0.03), ranges(6000, noise_m=0.03, seed=2)
     known = calib.fit(among(everything, ACROSS)).calibration
     # By the definition of synthetic ranges: half of both delays, and the curve at the reference power.

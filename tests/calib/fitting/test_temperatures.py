@@ -125,7 +125,7 @@ def test_temperatures_that_are_no_degrees_of_both_ends_are_refused():
             fitted(WARM, 3).correct(3.0, -85.0, -86.0, 1, 2, temperature_c=celsius)
 
 
-def test_delays_are_compared_at_one_temperature_or_not_at_all(tmp_path):
+def test_delays_are_compared_at_one_temperature_or_not_at_all():
     known, hotter = fitted(WARM, 3), fitted(replace(WARM, start_c=35.0), 3, temperature="shared")
     assert hotter.temperatures[0].reference_c - known.temperatures[0].reference_c > 12
     assert calib.compare(known, hotter).same
