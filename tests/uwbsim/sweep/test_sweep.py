@@ -19,13 +19,13 @@ import numpy as np
 import pytest
 
 from tests.errors import one_line
-from tests.processes import BIN, CONTEXT, refuse, succeed, wait_until
+from tests.processes import BIN, refuse, succeed, wait_until
 from tests.registered import registered
 from uwblink.errors import UwblinkError
 from uwblink.protocols.table import PROTOCOLS
 from uwbsim import ParameterError, ScenarioError, UwbsimError, load_design, run_sweep
 from uwbsim.sweep.executors import Cluster, ClusterLostError, Processes
-from uwbsim.sweep.runner import ResultStore, SweepSummary, TableError
+from uwbsim.sweep.runner import ResultStore, SweepSummary
 from uwbsim.world.channel import CHANNEL_EFFECTS, ChannelEffect
 
 HEAD = '[sweep]\nscenario = "icra2023/test1"\nprotocols = ["ss-cfo", "ds"]\n'
@@ -235,7 +235,8 @@ def test_errors_of_functions_fail_only_their_run(tmp_path, stranger):
     assert {row["error"] for row in rows(tmp_path / "out")} == {"'no such figure'"}
 
 
-def test_functions_that_other_processes_cannot_import_are_refused(tmp_path, stranger):
+def test_functions_that_other_processes_cannot_import_and_absent_ones_are_refused(tmp_path, stranger, monkeypatch):
+    monkeypatch.setattr("uwbsim.sweep.design.entry_points", lambda **_: ())
     for text, more, said in (
         (
             (CALIBRATE,),
@@ -244,16 +245,10 @@ def test_functions_that_other_processes_cannot_import_are_refused(tmp_path, stra
         ),
         ((CALIBRATE,), {"workers": 0, "evaluate": stranger.figures}, "`workers`: found 0"),
         ((), {"evaluate": stranger.figures}, "`evaluate`: can only be used with sweeps of flights"),
+        ((CALIBRATE,), {"workers": 1}, ".*no installed distribution offers one"),
     ):
         with pytest.raises(ParameterError, match=f"^{said}"):
             run_sweep(plan(tmp_path, *text), tmp_path / "out", **more)
-    assert not (tmp_path / "out").exists()
-
-
-def test_without_a_function_and_without_a_distribution_that_offers_one(tmp_path, monkeypatch):
-    monkeypatch.setattr("uwbsim.sweep.design.entry_points", lambda **_: ())
-    with pytest.raises(ParameterError, match="no installed distribution offers one"):
-        run_sweep(plan(tmp_path, CALIBRATE), tmp_path / "out", workers=1)
     assert not (tmp_path / "out").exists()
 
 
@@ -317,31 +312,16 @@ def done(alone, tmp_path):
     return p, tmp_path / "out"
 
 
-def cut(store):
-    store.write_bytes(store.read_bytes()[:20_000])
-
-
-def garbage(store):
-    data = bytearray(store.read_bytes())
-    data[12_288:] = os.urandom(len(data) - 12_288)
-    store.write_bytes(bytes(data))
-
-
-def with_sql(*statements):
-    def change(store):
-        with duckdb.connect(str(store)) as db:
-            for statement in statements:
-                db.execute(statement)
-
-    return change
+def with_sql(statement):
+    return lambda store: duckdb.connect(str(store)).execute(statement).close()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "damage",
     [
-        cut,
-        garbage,
+        lambda store: os.truncate(store, 20_000),
+        lambda store: store.write_bytes(store.read_bytes()[:12_288] + os.urandom(store.stat().st_size - 12_288)),
         with_sql("UPDATE identity SET value = NULL"),
         with_sql("UPDATE identity SET value = '{'"),
         with_sql("ALTER TABLE identity DROP COLUMN value"),
@@ -362,24 +342,12 @@ def test_a_damaged_store_is_one_line_and_stays_as_it_is(done, damage):
     assert (out / "results.csv").read_bytes() == before
 
 
-def _hold(path, pipe):
-    with ResultStore.open(path):
-        pipe.send("open")
-        pipe.recv()
-
-
 @pytest.mark.slow
 def test_two_sweeps_cannot_have_one_folder(done):
     p, out = done
-    ours, theirs = CONTEXT.Pipe()
-    other = CONTEXT.Process(target=_hold, args=(out / "results.duckdb", theirs))
-    other.start()
-    assert ours.recv() == "open"
-    with pytest.raises(TableError) as caught:
-        run_sweep(p, out, workers=1, resume=True)
-    ours.send("close")
-    other.join()
-    assert str(caught.value) == f"{out}/results.duckdb: another sweep writes its results there; give another folder"
+    said = f"{out}/results.duckdb: another sweep writes its results there; give another folder"
+    with ResultStore.open(out / "results.duckdb"):
+        refuse("uwbsim", "sweep", p.path, "-o", out, "--workers", 1, "--resume", naming=[said], timeout=60)
     assert len(rows(out)) == 24
 
 
