@@ -309,7 +309,14 @@ ONE_SIDED_M2 = (SPEED_OF_LIGHT * 1e-10) ** 2
 @pytest.mark.parametrize(
     ("name", "values", "mean_m", "variance_m2"),
     [
-        ("ss", {"scheduled": 300e-6}, pytest.approx(0.4495, abs=0.0005), 0),
+        # Half the reply times the error of the reading.
+        (
+            "ss-cfo",
+            {"carrier_std_ppm": 0.2},
+            pytest.approx(0, abs=1e-4),
+            pytest.approx((0.5 * SPEED_OF_LIGHT * 1538.7e-6 * 0.2e-6) ** 2, rel=1e-5),
+        ),
+        ("ss", {"scheduled": 300e-6, "carrier_std_ppm": 0.2}, pytest.approx(0.4495, abs=0.0005), 0),
         *((name, {"scheduled": 300e-6}, pytest.approx(0, abs=0.001), 0) for name in ("ds", "ds-alt", "ds-sym")),
         ("ss", BOTH | {"rate": (0, 0)}, pytest.approx(0, abs=1e-6), pytest.approx(ONE_SIDED_M2, rel=1e-3)),
         # ICRA 2023: 1 + r + r^2 times the variance of single-sided ranging, r = dt32/dt53; receive noise alone is half.
@@ -337,15 +344,6 @@ def test_bias_and_variance_are_those_of_the_papers(name, values, mean_m, varianc
     found = predict(PROTOCOLS[name], world(1, **values))
     assert found.mean_m[0] == mean_m
     assert found.variance_m2[0] == variance_m2
-
-
-def test_carrier_noise_adds_half_the_reply_times_it():
-    c = world(1, carrier_std_ppm=0.2)
-    by_carrier, plain = (predict(PROTOCOLS[name], c) for name in ("ss-cfo", "ss"))
-    expected_m = 0.5 * SPEED_OF_LIGHT * 1538.7e-6 * 0.2e-6
-    assert np.sqrt(by_carrier.parts_m2["carrier integrator"][0]) == pytest.approx(expected_m, rel=1e-6)
-    assert abs(by_carrier.mean_m[0]) < 1e-4
-    assert plain.parts_m2["carrier integrator"][0] == 0
 
 
 @pytest.mark.parametrize("name", [name for name in SIGMA if name != "none"])
@@ -386,19 +384,16 @@ SHORT = uwbsim.load("noiseless", {"run.duration_s": 2.0, "radio.rx_noise_ps": 10
 WITHOUT_EXCHANGES = uwbsim.load("noiseless", {"run.duration_s": 0.001})
 
 
-def test_protocols_are_names_rows_or_all():
+def test_protocols_are_names_rows_or_all_and_scenarios_may_be_files():
     row = replace(PROTOCOLS["ds"], name="ds-again")
     found = uwbsim.compare(SHORT, ["ds", row, PROTOCOLS["ds"]], count=500)
     assert [one.protocol for one in found.outcomes] == ["ds", "ds-again"]
     np.testing.assert_array_equal(found.samples["ds"], found.samples["ds-again"])
     assert [one.protocol for one in uwbsim.compare(SHORT, count=10).outcomes] == list(PROTOCOLS)
     assert uwbsim.optimum(SHORT, row).delay_s == uwbsim.optimum(SHORT, "ds").delay_s
+    assert uwbsim.optimum(uwbsim.shipped_scenarios()["noiseless"], "ss").protocol == "ss"
     said = uwbsim.predict_state(uwbsim.State(protocol=row))
     assert said.std_m == uwbsim.predict_state(uwbsim.State(protocol="ds")).std_m
-
-
-def test_a_scenario_may_be_a_file():
-    assert uwbsim.optimum(uwbsim.shipped_scenarios()["noiseless"], "ss").protocol == "ss"
 
 
 def test_results_print_themselves():
@@ -456,19 +451,16 @@ def closed_form_m(protocol):
 
 
 @pytest.mark.parametrize("protocol", ["ds", "ss", "ss-cfo", "ds-alt", "ds-sym"])
-def test_prediction_monte_carlo_and_flight_agree(protocol):
+def test_closed_form_prediction_monte_carlo_and_flight_agree(protocol):
     world = with_white_noise(protocol)
     conditions = conditions_of(world)
-    predicted = np.sqrt(predict(PROTOCOLS[protocol], conditions).pooled()[1])
+    prediction = predict(PROTOCOLS[protocol], conditions)
+    predicted = np.sqrt(prediction.pooled()[1])
+    if protocol in ("ds", "ss"):
+        assert np.sqrt(prediction.parts_m2["clocks"]) == pytest.approx(closed_form_m(protocol), rel=2e-3)
     assert np.std(range_errors_m(PROTOCOLS[protocol], conditions, 1, 20_000)) == pytest.approx(predicted, rel=0.03)
     flight = uwbsim.simulate(world, contention=False)
     assert np.std(raw_range(flight.exchanges) - flight.truth_m) == pytest.approx(predicted, rel=0.06)
-
-
-@pytest.mark.parametrize("protocol", ["ds", "ss"])
-def test_prediction_has_the_closed_form(protocol):
-    found = predict(PROTOCOLS[protocol], conditions_of(with_white_noise(protocol)))
-    np.testing.assert_allclose(np.sqrt(found.parts_m2["clocks"]), closed_form_m(protocol), rtol=2e-3)
 
 
 @pytest.mark.slow
