@@ -11,18 +11,21 @@ from uwblink.boards.ports import SerialPort, Terminal
 from uwbsim import Scenario, VirtualPorts
 from uwbsim.boards.server import FaultsFile, Server
 
+PLACES = {1: (0.0, 0.0, 0.0), 2: (3.0, 0.0, 0.0), 3: (1.0, 2.0, 0.0)}
 
-def bench_scenario(seed=1, **radio):
+
+def bench_scenario(seed=1, places=PLACES, **radio):
     """The layout of the captured transcripts: boards 1, 2, 3, skews +1.5, -2.0, +0.5 ppm."""
-    places = {1: (0.0, 0.0, 0.0), 2: (3.0, 0.0, 0.0), 3: (1.0, 2.0, 0.0)}
-    skews = {1: 1.5, 2: -2.0, 3: 0.5}
     return Scenario.model_validate(
         {
             "run": {"seed": seed, "duration_s": 60.0},
             "ranging": {"rate_hz": 100.0},
             "radio": {"first_path_at_1m_dbm": -78.0, **radio},
             "bodies": [{"name": f"b{k}", "motion": {"model": "static", "position_m": p}} for k, p in places.items()],
-            "tags": [{"id": k, "body": f"b{k}", "skew_ppm": skews[k], "delay_ns": 0.0} for k in places],
+            "tags": [
+                {"id": k, "body": f"b{k}", "skew_ppm": skew, "delay_ns": 0.0}
+                for k, skew in zip(places, (1.5, -2.0, 0.5, 0.0), strict=False)
+            ],
         }
     )
 

@@ -45,10 +45,7 @@ def heard(board, *kinds, within_s=10.0):
     found: list[m.Message] = []
     until_s = board._transport.now_s() + within_s
     while len(found) < len(kinds) and board._transport.now_s() < until_s:
-        for event in board.reports(0.05):
-            found += [event] if isinstance(event, kinds) else []
-            if len(found) == len(kinds):
-                break
+        found += [event for event in board.reports(0.05) if isinstance(event, kinds)]
     return found
 
 
@@ -206,8 +203,7 @@ def shape(data):
         return data
     parts = data.rstrip(b"\r\n").split(b"|")
     ids = {b"R05": 2, b"S05": 2, b"S01": 3}[parts[0]]
-    kinds = tuple(p if p in (b"0", b"0.0000") else b"." if b"." in p else b"n" for p in parts[ids:])
-    return (*parts[:ids], kinds)
+    return (*parts[:ids], *(p if p in (b"0", b"0.0000") else b"." if b"." in p else b"n" for p in parts[ids:]))
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda s: repr(next(x[3] for x in s if x[2] == "<-host"))[:30])
@@ -300,11 +296,8 @@ class Client:
         while b"\r\n" not in self.came and (left := until - self.transport.now_s()) > 0:
             self.came += self.transport.read(left)
         self.pass_time(self.random.uniform(*LATENCY_S))
-        data, self.came = self.came, b""
-        found = []
-        for part in re.split(rb"(?=[RS]\d\d\|)", data):
-            found += [e for e in Decoder(m.REPORTS).feed(part) if isinstance(e, m.Message)]
-        return found
+        parts, self.came = re.split(rb"(?=[RS]\d\d\|)", self.came), b""
+        return [e for part in parts for e in Decoder(m.REPORTS).feed(part) if isinstance(e, m.Message)]
 
 
 @pytest.fixture(params=["virtual", "real"])
@@ -327,12 +320,7 @@ def test_nine_of_ten_impulse_responses_reach_both_ends(clients):
     for _ in range(100):
         one.write(b"C05|%d|1|1|1\r" % target)
         for client in got:
-            found = []
-            for _ in range(3):
-                found += client.messages()
-                if any(isinstance(e, m.Cir) for e in found):
-                    break
-            got[client] += any(isinstance(e, m.Cir) for e in found)
+            got[client] += any(isinstance(e, m.Cir) for _ in range(3) for e in client.messages())
         for client in got:
             client.messages(0.02)
     assert min(got.values()) >= 90, got.values()
@@ -344,7 +332,6 @@ def test_a_scan_of_ids_finds_the_boards(clients):
     found = []
     for number in range(11):
         one.write(b"C05|%d|0|1|0\r" % number)
-        reports = [e for e in one.messages() if isinstance(e, m.RangeReport)]
-        found += [number for report in reports if report.neighbour == number]
+        found += [number for e in one.messages() if isinstance(e, m.RangeReport) and e.neighbour == number]
     assert other in found
     assert mine not in found

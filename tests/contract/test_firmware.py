@@ -6,7 +6,7 @@ import pytest
 
 from tests.boards import bench_scenario
 from uwblink.wire.messages import RangeCommand
-from uwbsim import Scenario, VirtualPorts
+from uwbsim import VirtualPorts
 from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, FinalPayload, Received
 
 
@@ -151,20 +151,10 @@ def test_passive_boards_answer_late_where_frames_are_lost():
     assert 1 <= sum(wait > 10 for wait in waits) <= 15
 
 
-def places(positions_m):
+def on_a_line(*positions_m):
     """Return boards on a line, board 1 at the first position."""
-    named = dict(enumerate(positions_m, 1))
-    return Scenario.model_validate(
-        {
-            "run": {"seed": 4, "duration_s": 60.0},
-            "ranging": {"rate_hz": 100.0},
-            "radio": {"first_path_at_1m_dbm": -78.0, "power_noise_db": 0.0, "capture_db": 6.0},
-            "bodies": [
-                {"name": f"b{k}", "motion": {"model": "static", "position_m": (x, 0.0, 1.0)}} for k, x in named.items()
-            ],
-            "tags": [{"id": k, "body": f"b{k}", "delay_ns": 0.0} for k in named],
-        }
-    )
+    places = {k: (x, 0.0, 1.0) for k, x in enumerate(positions_m, 1)}
+    return bench_scenario(4, places, power_noise_db=0.0, capture_db=6.0)
 
 
 @pytest.mark.parametrize(
@@ -181,7 +171,7 @@ def test_of_two_frames_at_once_the_first_is_received_where_it_is_stronger_by_the
     other_m, lag_us, received
 ):
     """Board 1 polls board 2, two metres away, and board 3 polls board 4 slightly later or earlier."""
-    bench = VirtualPorts(places([0.0, 2.0, other_m, other_m + 2])).bench
+    bench = VirtualPorts(on_a_line(0.0, 2.0, other_m, other_m + 2)).bench
     came: list[Received | None] = []
     bench.boards[2].radio._interrupt = came.append
     starts = {1: 0, 3: lag_us * NS_PER_US}
@@ -196,7 +186,7 @@ def test_of_two_frames_at_once_the_first_is_received_where_it_is_stronger_by_the
 def test_two_exchanges_at_once_disturb_each_other_near_by_and_not_far_away():
     shares = {}
     for distance_m in (3.0, 900.0):
-        ports = VirtualPorts(places([0.0, 2.0, distance_m, distance_m + 2.0]))
+        ports = VirtualPorts(on_a_line(0.0, 2.0, distance_m, distance_m + 2.0))
         frames = sent_frames(ports)
         writes = [(10 + 70 * k, board, b"C05|%d|0|1|0\r" % (board + 1)) for k in range(20) for board in (1, 3)]
         played(*writes, until_ms=10 + 70 * 20, ports=ports)
