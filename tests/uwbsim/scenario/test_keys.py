@@ -4,6 +4,7 @@ import json
 import re
 import tomllib
 from pathlib import Path
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -13,10 +14,11 @@ from docs.site.schema import UNITS, described, reference, unit_of
 from tests import processes
 from tests.errors import one_line
 from tests.shared_data import ROOT
+from tests.uwbsim.simulation.test_protocols import calibrated_error_m
 from uwblink import Recording, load
 from uwblink.database import write_tables
-from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT
-from uwblink.twr import COLUMNS, delay_weights, raw_range
+from uwblink.ticks import METRES_PER_TICK
+from uwblink.twr import COLUMNS
 from uwbsim.boards.server import FaultsFile
 from uwbsim.scenario import copy_scenarios, shipped_scenarios
 from uwbsim.scenario.base import BY_UNIT, check_limits
@@ -268,13 +270,7 @@ def test_common_random_numbers():
 
 
 def test_thirty_hours_are_as_exact_as_a_second():
-    scenario = uwbsim.load(ROOT / "scenarios" / "wrap" / "wrap.toml")
-    result = uwbsim.simulate(scenario)
-    planted = {int(k): d * 1e-9 for k, d in scenario.planted()["delays_ns"].items()}
-    e = result.exchanges
-    first, second = delay_weights(e)
-    delay = np.array([planted.get(k, 0.0) for k in range(4)])
-    error = raw_range(e) + SPEED_OF_LIGHT * (first * delay[e.initiator] + second * delay[e.target]) - result.truth_m
+    error = calibrated_error_m(uwbsim.load("wrap/wrap"))
     assert len(error) == 5400
     assert np.abs(error).max() < METRES_PER_TICK
 
@@ -402,25 +398,14 @@ def test_printed_and_saved_flights_agree(tmp_path):
 ROWS = [{"name": "a", "n": 1, "x": 0.5}, {"name": "b", "n": 2, "x": None}]
 
 
-class Failing:
-    """Rows that can be read once, and the second time only partly."""
-
-    def __init__(self):
-        self.left = 3
-
-    def __iter__(self):
-        for row in ROWS:
-            self.left -= 1
-            if self.left < 0:
-                raise KeyboardInterrupt
-            yield row
-
-
 def test_tables_that_fail_half_way_leave_what_was_there(tmp_path):
     table, parquet = tmp_path / "t.csv", tmp_path / "t.parquet"
     write_tables(table, parquet, ROWS, force=False)
     before = table.read_bytes(), parquet.read_bytes()
+    # Rows that can be read once, and the second time only partly.
+    failing = MagicMock()
+    failing.__iter__.side_effect = [iter(ROWS), iter(Mock(side_effect=[ROWS[0], KeyboardInterrupt]), None)]
     with pytest.raises(KeyboardInterrupt):
-        write_tables(table, parquet, Failing(), force=True)
+        write_tables(table, parquet, failing, force=True)
     assert (table.read_bytes(), parquet.read_bytes()) == before
     assert sorted(file.name for file in tmp_path.iterdir()) == ["t.csv", "t.parquet"]
