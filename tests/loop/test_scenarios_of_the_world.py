@@ -20,23 +20,27 @@ from benchmarks.nlos import (
     published_error_m,
     vendor_rule,
 )
-from calib import Calibration, evaluate, fit, load_calibration, load_ranges
+from calib import evaluate, fit, load_calibration, load_ranges
 from calib.data.ranges import concatenate
 from calib.evaluation.statistics import pair_rows
 from tests import processes
 from tests.calib import synthetic
-from tests.shared_data import ROOT, shared
+from tests.shared_data import shared
 from uwblink import SPEED_OF_LIGHT, Recording
 from uwblink import load as load_recording
 from uwbsim import load, simulate
 
-SCENARIOS = ROOT / "scenarios"
-
 
 def ranges(tmp_path, name, *settings):
     path = tmp_path / "f.uwb"
-    simulate(load(SCENARIOS / name, settings)).save(path, force=True)
+    simulate(load(name, settings)).save(path, force=True)
     return load_ranges(path)
+
+
+def without_planted_m(r):
+    """Return the errors (n,) of simulated ranges without the planted delays."""
+    delay_m = np.array([r.planted["delays_ns"].get(str(tag), 0.0) for tag in range(7)]) * 1e-9 * SPEED_OF_LIGHT
+    return r.raw_m + r.weight_initiator * delay_m[r.initiator] + r.weight_target * delay_m[r.target] - r.truth_m
 
 
 def delays(calibration):
@@ -98,10 +102,7 @@ def test_true_delays_correct_ranges_with_both_replies(tmp_path, reply_uus):
     dt53 = 0.3 ms.
     """
     r = ranges(tmp_path, "noiseless.toml", f"ranging.response_delay_uus={reply_uus}")
-    planted = {int(tag): delay for tag, delay in r.planted["delays_ns"].items()}
-    delay = np.array([planted.get(tag, 0.0) for tag in range(7)])
-    flight = r.weight_initiator * delay[r.initiator] + r.weight_target * delay[r.target]
-    error = r.raw_m + SPEED_OF_LIGHT * 1e-9 * flight - r.truth_m
+    error = without_planted_m(r)
     for pair, rows in pair_rows(r).items():
         assert abs(np.median(error[rows])) < 0.001, pair
 
@@ -110,7 +111,7 @@ def test_true_delays_correct_ranges_with_both_replies(tmp_path, reply_uus):
 def test_a_fit_of_boards_that_warm_up_has_a_warning(tmp_path):
     """Ranges grow by 2.15 mm/K for each of two tags, and shrink by 5.35 cm/V as batteries discharge."""
     path = tmp_path / "warm.uwb"
-    simulate(load(SCENARIOS / "warm_up" / "warm_up.toml"), contention=False).save(path)
+    simulate("warm_up/warm_up", contention=False).save(path)
     r = load_ranges(path)
     error, time_s = r.raw_m - r.truth_m, r.time_ns * 1e-9
     grown = np.mean(error[time_s > 220]) - np.mean(error[time_s < 20])
@@ -168,15 +169,12 @@ def test_reflections_are_detected_in_the_unfitted_half_of_a_real_flight():
 # The loop through the wire: encoding and decoding change nothing. tests/test_readme.py calibrates served boards.
 
 
-TRAIN = ROOT / "scenarios" / "icra2023" / "train.toml"
-
-
 @pytest.mark.slow
 def test_a_flight_through_encode_and_decode_calibrates_to_the_same_bytes(tmp_path):
     for name, more in (("direct", []), ("wire", ["--through-wire"])):
         (tmp_path / name).mkdir()
         flight = tmp_path / name / "flight.uwb"
-        processes.succeed("uwbsim", "run", TRAIN, "-o", flight, "--set", "run.duration_s=20", *more)
+        processes.succeed("uwbsim", "run", "icra2023/train", "-o", flight, "--set", "run.duration_s=20", *more)
         processes.succeed("calib", "fit", flight, "-o", tmp_path / name / "c.json")
     assert (tmp_path / "direct" / "c.json").read_bytes() == (tmp_path / "wire" / "c.json").read_bytes()
     processes.succeed("uwblink", "replay", tmp_path / "wire" / "flight.uwb", "-o", tmp_path / "wire" / "again.uwb")
@@ -184,15 +182,12 @@ def test_a_flight_through_encode_and_decode_calibrates_to_the_same_bytes(tmp_pat
 
 def test_a_flight_in_which_nothing_is_received_goes_through_the_wire(tmp_path):
     short = ["--set", "run.duration_s=1", "--set", "radio.sensitivity_dbm=0"]
-    processes.succeed("uwbsim", "run", TRAIN, "-o", tmp_path / "f.uwb", "--through-wire", *short)
+    processes.succeed("uwbsim", "run", "icra2023/train", "-o", tmp_path / "f.uwb", "--through-wire", *short)
     flight = load_recording(tmp_path / "f.uwb")
     assert len(flight.exchanges) == 0 < len(flight.faults)
 
 
 # The whole loop on the icra2023 scenarios: simulate, fit, evaluate, and compare with the planted values.
-
-
-ICRA2023 = ROOT / "scenarios" / "icra2023"
 
 
 def run(*words):
@@ -203,14 +198,9 @@ def run(*words):
 def flights(tmp_path_factory):
     folder = tmp_path_factory.mktemp("icra2023")
     for name in ("train", "test1", "test2"):
-        run("uwbsim", "run", ICRA2023 / f"{name}.toml", "-o", folder / f"{name}.uwb")
+        run("uwbsim", "run", f"icra2023/{name}", "-o", folder / f"{name}.uwb")
     run("calib", "fit", folder / "train.uwb", "-o", folder / "calibration.json")
     return folder
-
-
-@pytest.fixture(scope="module")
-def calibration(flights) -> Calibration:
-    return load_calibration(flights / "calibration.json")
 
 
 @pytest.mark.slow
@@ -232,10 +222,11 @@ def test_raw_errors_resemble_the_paper(flights):
 
 
 @pytest.mark.slow
-def test_planted_delays_and_curve_are_found_within_30_ps_and_5_mm_rms(flights):
+def test_planted_delays_and_curve_are_found_within_30_ps_and_5_mm_rms_and_sigma_is_positive(flights):
     found = evaluated(flights / "train.uwb", flights / "calibration.json")["planted"]
     assert max(map(abs, found["delay_error_ns"].values())) < 0.030
     assert found["curve_rms_m"] < 0.005
+    assert np.all(load_calibration(flights / "calibration.json").sigma_curve(np.linspace(-1, 10, 1000)) > 0)
 
 
 def evaluated(recording, calibration):
@@ -261,11 +252,6 @@ def test_each_stage_of_the_recipe_reduces_the_errors(flights, tmp_path):
 
 
 @pytest.mark.slow
-def test_sigma_is_positive_everywhere(calibration):
-    assert np.all(calibration.sigma_curve(np.linspace(-1, 10, 1000)) > 0)
-
-
-@pytest.mark.slow
 def test_fit_does_not_read_what_was_planted(flights, tmp_path):
     copy = tmp_path / "test1.uwb"
     with Recording.open(flights / "test1.uwb") as source, Recording.create(copy) as target:
@@ -285,9 +271,7 @@ def test_powers_and_errors_by_power_are_those_of_the_papers_samples(flights):
     """
     lifted, bias = np.loadtxt(shared("icra2023_bias_fpp.csv"), delimiter=",", skiprows=1).T
     r = load_ranges(flights / "train.uwb")
-    delay = np.array([r.planted["delays_ns"].get(str(tag), 0.0) for tag in range(7)]) * 1e-9
-    weighted = r.weight_initiator * delay[r.initiator] + r.weight_target * delay[r.target]
-    error, mine = r.raw_m + SPEED_OF_LIGHT * weighted - r.truth_m, synthetic.lifted(r.fpp1_dbm, r.fpp2_dbm)
+    error, mine = without_planted_m(r), synthetic.lifted(r.fpp1_dbm, r.fpp2_dbm)
     # Flights differ in rooms and durations: 2 % of lifted power in the bulk, 5 % at the ends.
     np.testing.assert_allclose(np.quantile(mine, [0.05, 0.5, 0.95]), np.quantile(lifted, [0.05, 0.5, 0.95]), atol=0.06)
     assert mine.max() < 1.6
