@@ -11,6 +11,7 @@ import pytest
 
 import uwbsim
 from tests.boards import bench_scenario, served
+from tests.fuzz.mutations import flip
 from tests.processes import wait_until
 from uwblink.boards.board import Board
 from uwblink.errors import PortLostError, PortMissingError, RefusedError
@@ -193,17 +194,6 @@ def command(rng):
     return b"C%02d" % key + b"".join(b"|" + part for part in parts) + b"\r"
 
 
-def mangled(rng, data):
-    """Return the same with bytes replaced, removed, or doubled."""
-    data = bytearray(data)
-    for _ in range(rng.randrange(1, 4)):
-        at = rng.randrange(len(data))
-        data[at : at + 1] = rng.choice((b"", rng.randbytes(1), data[at : at + 1] * 2, b"|", b"\r", b"C"))
-        if not data:
-            break
-    return bytes(data)
-
-
 def test_no_byte_ends_the_bench_or_another_board():
     rng = random.Random(20261121)
     ports = uwbsim.VirtualPorts(bench_scenario(), lost_share=0.1)
@@ -212,7 +202,7 @@ def test_no_byte_ends_the_bench_or_another_board():
     for number in range(COMMANDS):
         kind = rng.random()
         data = rng.randbytes(rng.randrange(1, 90)) if kind < RANDOM_SHARE else command(rng)
-        victim.write(mangled(rng, data) if kind > 1 - MANGLED_SHARE else data)
+        victim.write((flip(data, rng) if kind > 1 - MANGLED_SHARE else None) or data)
         bench.advance(int(bench.env.now) + rng.choice((NS_PER_MS // 10, NS_PER_MS, NS_PER_MS, 2 * NS_PER_MS)))
         if not (victim.alive and victim.usb.open):
             deaths += 1
@@ -352,12 +342,10 @@ def test_an_unplugged_board_is_gone_until_it_is_plugged_in_again():
     port, board = ports.port(tag), ports.bench.boards[tag]
     port.write(b"C01\r")
     board.power_off()
-    with pytest.raises(PortLostError):
-        port.read(0.1)
-    with pytest.raises(PortLostError):
-        port.write(b"C01\r")
-    with pytest.raises(PortMissingError):
-        ports.open(name)
+    uses = (lambda: port.read(0.1), lambda: port.write(b"C01\r"), lambda: ports.open(name))
+    for use, lost in zip(uses, (PortLostError, PortLostError, PortMissingError), strict=True):
+        with pytest.raises(lost):
+            use()
     assert ports.moved(name, None) is None
     board.power_cycle()
     assert (ports.open(name), ports.moved(name, None)) == (port, name)
