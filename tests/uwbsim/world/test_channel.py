@@ -17,17 +17,18 @@ LOSS_DB = 36.0
 ZERO, ONE = np.array([0]), np.array([1])
 
 
-def scenario(places=((0.0, 0.0, 1.0), (4.0, 0.0, 1.0)), tags=({}, {}), **more):
+def scenario(places=((0.0, 0.0, 1.0), (4.0, 0.0, 1.0)), tags=(), overrides=(), **more):
+    """Return a scenario of tags without motion and noise, with more keys, tables and bodies."""
     quiet = {"rx_noise_ps": 0.0, "power_noise_db": 0.0, "quantize": False, "first_path_at_1m_dbm": -70.0}
-    bodies = [{"name": n, "motion": {"model": "static", "position_m": p}} for n, p in zip("ab", places, strict=True)]
+    bodies = [{"name": f"b{k}", "motion": {"model": "static", "position_m": p}} for k, p in enumerate(places)]
     base = {
         "run": {"duration_s": 1.0, "seed": 2},
-        "ranging": {"rate_hz": 40.0, "pairs": [[1, 2]], "get_cir": True},
+        "ranging": {"rate_hz": 40.0, "pairs": [[1, 2]]} | more.pop("ranging", {}),
         "radio": quiet | more.pop("radio", {}),
         "bodies": bodies + more.pop("bodies", []),
-        "tags": [{"id": k + 1, "body": n} | tag for k, (n, tag) in enumerate(zip("ab", tags, strict=True))],
+        "tags": [{"id": k + 1, "body": f"b{k}"} | tag for k, tag in enumerate(tags or [{}] * len(places))],
     }
-    return uwbsim.load(base | more)
+    return uwbsim.load(base | more, overrides)
 
 
 def autocorrelation(values, lag):
@@ -48,6 +49,12 @@ def paths(world, detour_m=0.0):
     """Return the paths of the first link at the start, as in a response."""
     (found,) = World(world).paths(ZERO, ONE, ZERO, np.array([detour_m]))
     return found
+
+
+def first_path_dbm(row):
+    """Return the power of the first path by the formula of the chip, from printed taps (User Manual, 4.7.1)."""
+    taps = np.array(row.magnitudes, dtype=float)[int(row.first_path_index) + np.arange(1, 4)]
+    return 10 * np.log10(np.sum(taps**2) / 118**2) - 121.74
 
 
 def post(loss_db_per_m):
@@ -108,15 +115,10 @@ def test_echoes_go_through_obstacles_and_bodies_as_the_direct_path_does():
 
 @pytest.mark.parametrize("at_1m_dbm", [-70.0, -76.0, -82.0])
 def test_impulse_responses_follow_the_power_of_the_link(at_1m_dbm):
-    """The formula of the chip, applied to the printed taps, gives the first-path power (User Manual, 4.7.1)."""
-    flight = uwbsim.simulate(scenario(radio={"first_path_at_1m_dbm": at_1m_dbm}))
-    found = []
-    for row in flight.cirs:
-        after = np.floor(row.first_path_index).astype(int) + np.arange(1, 4)
-        squares = np.sum(np.array(row.magnitudes, dtype=float)[after] ** 2)
-        found.append(10 * np.log10(squares / 118**2) - 121.74)
+    flight = uwbsim.simulate(scenario(radio={"first_path_at_1m_dbm": at_1m_dbm}, ranging={"get_cir": True}))
     # Diffuse paths, the firmware's estimate of magnitudes and the positions of the taps cause scatter.
-    assert np.median(found) == pytest.approx(flight.exchanges.fpp2_dbm[0], abs=1.5)
+    found = np.median([first_path_dbm(row) for row in flight.cirs])
+    assert found == pytest.approx(flight.exchanges.fpp2_dbm[0], abs=1.5)
 
 
 def test_a_ranges_own_detour_brings_its_echoes_nearer():
@@ -124,7 +126,8 @@ def test_a_ranges_own_detour_brings_its_echoes_nearer():
     plain, late = (paths(scenario(room=ROOM), detour_m) for detour_m in (0.0, 0.3))
     assert late.delay_s[0] == pytest.approx(plain.delay_s[0] - 0.3 / SPEED_OF_LIGHT)
     room = ROOM | {"max_m": [8.0, 4.0, 40.0], "min_m": [-60.0, -60.0, -0.5], "reflection_loss_db": 0.0}
-    flight = uwbsim.simulate(scenario(room=room, radio={"multipath": {"probability": 1.0, "mean_excess_m": 0.2}}))
+    radio = {"multipath": {"probability": 1.0, "mean_excess_m": 0.2}}
+    flight = uwbsim.simulate(scenario(room=room, radio=radio, ranging={"get_cir": True}))
     excess = raw_range(flight.exchanges) - flight.truth_m
     way = 3.0  # by the floor, 1.5 m below: 5 m instead of 4 m
     for row, own in zip(flight.cirs, excess.tolist(), strict=True):
@@ -156,18 +159,14 @@ def test_weak_transmitters_are_not_received():
 
 
 def still_flight(radio, second=None, duration_s=400.0, **ranging):
-    places = {"b0": (0, 0, 2), "b1": (3, 4, 2)}
-    quiet = {"first_path_at_1m_dbm": -80.0, "quantize": False, "rx_noise_ps": 0.0, "skew_noise_ppm": 0.0}
-    return uwbsim.simulate(
-        {
-            "run": {"duration_s": duration_s, "seed": 4},
-            "ranging": {"rate_hz": 50.0} | ranging,
-            "radio": quiet | radio,
-            "bodies": [{"name": n, "motion": {"model": "static", "position_m": p}} for n, p in places.items()],
-            "tags": [{"id": 1, "body": "b0"}, {"id": 2, "body": "b1"} | (second or {})],
-        },
-        contention=False,
+    world = scenario(
+        ((0.0, 0.0, 2.0), (3.0, 4.0, 2.0)),
+        ({}, second or {}),
+        run={"duration_s": duration_s, "seed": 4},
+        ranging={"rate_hz": 50.0} | ranging,
+        radio={"first_path_at_1m_dbm": -80.0, "skew_noise_ppm": 0.0} | radio,
     )
+    return uwbsim.simulate(world, contention=False)
 
 
 def test_fading_has_the_set_spread_and_lifetime():

@@ -6,7 +6,8 @@ from scipy.integrate import quad
 from scipy.optimize import minimize
 
 import uwbsim
-from tests.uwbsim.world.test_channel import ONE, ZERO, autocorrelation, link
+from tests.uwbsim.world.test_channel import ONE, ZERO, autocorrelation, first_path_dbm, link
+from tests.uwbsim.world.test_channel import scenario as still
 from uwblink import raw_range
 from uwbsim.scenario.bodies import Material, Obstacle, Shadow
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
@@ -29,20 +30,10 @@ A, B = (1.0, 2.0, 1.0), (5.0, 3.5, 1.6)
 WAVELENGTH_M = 299_702_547 / 3993.6e6
 
 
-def scenario(*, places=(A, B), motion=None, scatterers=0, stamp_noise=False, **more):
-    quiet = {"rx_noise_ps": 0.0, "power_noise_db": 0.0, "quantize": False, "first_path_at_1m_dbm": -72.0}
-    model = {"model": "geometric", "scatterers": scatterers, "stamp_noise": stamp_noise}
-    bodies = [{"name": f"b{k}", "motion": {"model": "static", "position_m": list(p)}} for k, p in enumerate(places)]
-    if motion:
-        bodies[0]["motion"] = motion
-    base = {
-        "run": {"duration_s": 1.0, "seed": 2},
-        "ranging": {"rate_hz": 40.0, "pairs": [[1, 2]]} | more.pop("ranging", {}),
-        "radio": quiet | {"multipath": model} | more.pop("radio", {}),
-        "bodies": bodies + more.pop("bodies", []),
-        "tags": [{"id": k + 1, "body": f"b{k}"} for k in range(len(places))],
-    }
-    return uwbsim.load(base | more)
+def scenario(*, places=(A, B), motion=None, scatterers=0, stamp_noise=False, radio=None, **more):
+    multipath = {"model": "geometric", "scatterers": scatterers, "stamp_noise": stamp_noise}
+    radio = {"first_path_at_1m_dbm": -72.0, "multipath": multipath} | (radio or {})
+    return still(places, (), {"bodies.0.motion": motion} if motion else {}, radio=radio, **more)
 
 
 def world_paths(world, time_s=0.5):
@@ -195,12 +186,8 @@ def test_excess_shows_in_powers_and_responses(slow_flight):
 
 
 def test_responses_have_the_first_path_where_the_stamp_is_with_its_power(slow_flight):
-    powers = []
-    for row in slow_flight.cirs:
-        taps = np.array(row.magnitudes, dtype=float)[int(row.first_path_index) + np.arange(1, 4)]
-        powers.append(10 * np.log10(np.sum(taps**2) / 118**2) - 121.74)
     # The firmware's estimate of magnitudes, noise, and the positions of the taps cause scatter.
-    difference = np.array(powers) - slow_flight.exchanges.fpp2_dbm
+    difference = np.array([first_path_dbm(row) for row in slow_flight.cirs]) - slow_flight.exchanges.fpp2_dbm
     assert np.median(difference) == pytest.approx(0.3, abs=0.5)
     assert np.quantile(np.abs(difference - np.median(difference)), 0.8) < 1.0
 
