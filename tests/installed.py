@@ -8,7 +8,6 @@ the time of each step, and the size of the environment.
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import subprocess
 import sys
@@ -17,9 +16,9 @@ import time
 from pathlib import Path
 from typing import Final
 
-from tests.builds import ROOT, built
+from tests import pages
+from tests.builds import built
 
-COMMANDS: Final = ("uwbsim", "uwblink", "calib")
 FIRST: Final = (
     "uwbsim --version",
     "uwbsim scenarios",
@@ -29,15 +28,6 @@ FIRST: Final = (
     "calib fit sample.uwb -o sample.json",
     "uwbsim schema",
 )
-"""Folders that are not copied."""
-
-
-def readme_commands() -> list[str]:
-    """Return the commands of the README's plain blocks (`sh`), in order."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"^```sh\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
-    lines = [line.strip() for block in blocks for line in block.splitlines()]
-    return [line for line in lines if line.split(" ")[0] in COMMANDS]
 
 
 def timed(what: str, command: list[str], cwd: Path, path: str) -> None:
@@ -67,7 +57,8 @@ def main(folder: Path) -> int:
     python = str(environment / "bin" / "python")
     timed("pip install of the wheel", [python, "-m", "pip", "install", "--quiet", str(wheel)], folder, path)
     print(f"{size_mb(environment) - before:7.0f} MB in {environment.name} beyond pip itself")
-    for line in [*FIRST, "uwbsim scenarios -o scenarios", *readme_commands()]:
+    blocks = (block for block in pages.blocks(pages.ROOT / "README.md") if block.language == "sh")
+    for line in [*FIRST, "uwbsim scenarios -o scenarios", *(line for b in blocks for line in pages.lines(b.code))]:
         timed(line, shlex.split(line), work, path)
     return 0
 

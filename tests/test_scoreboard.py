@@ -1,6 +1,5 @@
 """Values of the scoreboard are those of the files that its commands write, computed here by NumPy alone."""
 
-import csv
 import re
 
 import numpy as np
@@ -43,16 +42,11 @@ def spread(errors):
 def corrected(work, recording, calibration):
     """Return raw and corrected errors in metres (n,) of a recording, and their sigma, as written by `calib apply`."""
     processes.succeed("calib", "apply", recording, "-c", calibration, "-o", "applied", "--to", "csv", cwd=work)
-    columns = []
-    for name in ("exchanges", "corrected"):
-        with (work / "applied" / f"{name}.csv").open(newline="") as file:
-            rows = list(csv.DictReader(file))
-        columns.append({key: np.array([float(row[key] or "nan") for row in rows]) for key in rows[0] if key in WANTED})
-    exchanges, applied = columns
+    files = (work / "applied" / f"{name}.csv" for name in ("exchanges", "corrected"))
+    exchanges, applied = (np.genfromtxt(file, delimiter=",", names=True) for file in files)
     return applied["raw_m"] - exchanges["truth_m"], applied["corrected_m"] - exchanges["truth_m"], applied["sigma_m"]
 
 
-WANTED = ("truth_m", "raw_m", "corrected_m", "sigma_m")
 PAPER = ["icra2023_bias_fpp.csv", "icra2023_published_fits.json"]
 SWARM = ["swarm_broadcast_logs.tar.xz"]
 MILUV = ["miluv_cirObstacles_3_random_0.tar.xz", "miluv_published_calibration.json"]

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import gzip
-import io
 import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
+
+import duckdb
 
 import calib
 import uwblink
@@ -218,9 +218,7 @@ def _write_tables(folder: Path) -> None:
     table = (ROOT / "docs/examples/exchanges.csv").read_bytes()
     (folder / "table.csv").write_bytes(table)
     (folder / "table.csv.gz").write_bytes(gzip.compress(table, mtime=0))
-    rows = list(csv.DictReader(io.StringIO(table.decode())))
-    lines = [json.dumps({name: _value(cell) for name, cell in row.items()}) for row in rows[:10]]
-    (folder / "table.jsonl").write_text("".join(f"{line}\n" for line in lines))
+    duckdb.sql(f"COPY (FROM '{folder}/table.csv' LIMIT 10) TO '{folder}/table.jsonl' (FORMAT json)")
     live = folder / "flight.uwb"
     export_recording(live, folder / "parquet", to="parquet")
     shutil.copyfile(folder / "parquet/exchanges.parquet", folder / "table.parquet")
@@ -250,13 +248,6 @@ def _write_forms(folder: Path) -> None:
     )
     for name, write in (("m.csv", poses.motive), ("v.csv", poses.vicon), ("q.tsv", poses.qualisys)):
         shutil.move(write(folder), folder / f"form_{name}")
-
-
-def _value(cell: str) -> float | str:
-    try:
-        return float(cell)
-    except ValueError:
-        return cell
 
 
 def _tag(tag: uwblink.Tag) -> str:
