@@ -4,95 +4,73 @@ The disk is full in that no file may exceed some length, which the system enforc
 here.
 """
 
-import importlib
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import typer
 
 import calib
 import uwblink
 import uwbsim
-from docs.site.commands import leaves
 from tests.boards import served
+from tests.fuzz.options import commands
+from tests.fuzz.seeds import write_seeds
 from tests.processes import refuse, run
 from tests.shared_data import ROOT
 from uwblink.cli.shared import WRITTEN
-from uwblink.exporters import export_recording
-
-NOISELESS = ROOT / "scenarios" / "noiseless.toml"
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    """A folder with a short flight, and its trajectories as files."""
+def seeds(tmp_path_factory):
+    """A folder with inputs of all commands."""
     folder = tmp_path_factory.mktemp("seeds")
-    (folder / "s.toml").write_text(NOISELESS.read_text().replace("duration_s = 60.0", "duration_s = 2.0"))
-    uwbsim.simulate(folder / "s.toml").save(folder / "f.uwb")
-    export_recording(folder / "f.uwb", folder / "tum", to="tum")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def seeds(flight):
-    """The same folder with all inputs of the commands in the table."""
-    flown = uwblink.load(flight / "f.uwb")
-    calib.fit(flown).calibration.save(flight / "c.json")
-    x = flown.exchanges
-    calib.fit(replace(flown, exchanges=x[(x.initiator != 6) & (x.target != 6)])).calibration.save(flight / "five.json")
-    shutil.copyfile(ROOT / "docs" / "examples" / "exchanges.csv", flight / "t.csv")
-    ports = uwbsim.VirtualPorts(uwbsim.load(flight / "s.toml"))
-    uwblink.record([*ports.names.values()], flight / "boards.uwb", uwblink.RangingPlan(), using=ports, duration_s=2.0)
+    write_seeds(folder)
     string = (ROOT / "scenarios/string/string.toml").read_text().replace("stay_s = 140.0", "stay_s = 10.0")
-    uwbsim.simulate(string.replace("duration_s = 1200.0", "duration_s = 160.0")).save(flight / "string.uwb")
-    calib.export(calib.load_calibration(flight / "c.json"), "miluv", flight / "miluv.json")
-    for form in ("csv", "mcap"):
-        export_recording(flight / "f.uwb", flight / form, to=form)
-    return flight
+    uwbsim.simulate(string.replace("duration_s = 1200.0", "duration_s = 160.0")).save(folder / "string.uwb")
+    calib.export(calib.load_calibration(folder / "calibration.json"), "miluv", folder / "miluv.json")
+    return folder
 
 
 COMMANDS = (
     # A log that cannot grow, a file that cannot be completed at the end, and one that cannot be created.
-    ("uwbsim run {s.toml} -o out.uwb", 40_000),
-    ("uwbsim run {s.toml} -o out.uwb", 300_000),
-    ("uwbsim run {s.toml} -o out.uwb", 4_000),
-    ("uwbsim show {s.toml} -o out.png", 1_000),
-    ("uwbsim compare {s.toml} -o out -n 200 --protocols ss,ds", 1_000),
-    ("uwbsim optimum {s.toml} -o out --protocols ds", 1_000),
+    ("uwbsim run {scenario.toml} -o out.uwb", 40_000),
+    ("uwbsim run {scenario.toml} -o out.uwb", 300_000),
+    ("uwbsim run {scenario.toml} -o out.uwb", 4_000),
+    ("uwbsim show {scenario.toml} -o out.png", 1_000),
+    ("uwbsim compare {scenario.toml} -o out -n 200 --protocols ss,ds", 1_000),
+    ("uwbsim optimum {scenario.toml} -o out --protocols ds", 1_000),
     ("uwbsim scenarios icra2023 -o out", 300),
     ("uwbsim scenarios icra2023 -o out/deep/er", 1_500),
-    ("uwbsim twin {f.uwb} -c {c.json} -o out.toml", 1_000),
-    ("uwblink import csv {t.csv} -o out.uwb", 20_000),
-    ("uwblink import exported {csv} -o out.uwb", 20_000),
-    ("uwblink import guess {t.csv} -o out.toml", 100),
-    ("uwblink import bag {mcap/recording.mcap} -o out.uwb", 20_000),
+    ("uwbsim twin {flight.uwb} -c {calibration.json} -o out.toml", 1_000),
+    ("uwblink import csv {table.csv} -o out.uwb", 20_000),
+    ("uwblink import exported {exported} -o out.uwb", 20_000),
+    ("uwblink import guess {table.csv} -o out.toml", 100),
+    ("uwblink import bag {flight.mcap} -o out.uwb", 20_000),
     ("uwblink replay {boards.uwb} -o out.uwb", 20_000),
-    ("uwblink export {f.uwb} --to csv -o out", 10_000),
-    ("uwblink export {f.uwb} --to parquet -o out", 1_000),
-    ("uwblink export {f.uwb} --to mcap -o out.mcap", 10_000),
-    ("uwblink export {f.uwb} --to rosbag2 -o out", 10_000),
-    ("uwblink export {f.uwb} --to tum -o out", 1_000),
-    ("calib fit {f.uwb} -o out.json", 1_000),
-    ("calib add-tag {f.uwb} -c {five.json} --tag 6 -o out.json", 1_000),
+    ("uwblink export {flight.uwb} --to csv -o out", 10_000),
+    ("uwblink export {flight.uwb} --to parquet -o out", 1_000),
+    ("uwblink export {flight.uwb} --to mcap -o out.mcap", 10_000),
+    ("uwblink export {flight.uwb} --to rosbag2 -o out", 10_000),
+    ("uwblink export {flight.uwb} --to tum -o out", 1_000),
+    ("calib fit {flight.uwb} -o out.json", 1_000),
+    ("calib add-tag {flight.uwb} -c {others.json} --tag 6 -o out.json", 1_000),
     ("calib survey {string.uwb} --known line -o out.json", 100),
     ("calib plan survey 4 --on line -o out.html", 1_000),
     ("calib import miluv {miluv.json} -o out.json", 100),
     ("calib sample -o out.uwb -n 100", 20_000),
-    ("calib apply {f.uwb} -c {c.json} -o out.uwb", 50_000),
+    ("calib apply {flight.uwb} -c {calibration.json} -o out.uwb", 50_000),
     *(
-        (f"calib apply {{f.uwb}} -c {{c.json}} --to {form} -o out", 1_000)
+        (f"calib apply {{flight.uwb}} -c {{calibration.json}} --to {form} -o out", 1_000)
         for form in ("csv", "parquet", "mcap", "rosbag2")
     ),
     *(
-        (f"calib export {{c.json}} --to {form} -o out", 100)
+        (f"calib export {{calibration.json}} --to {form} -o out", 100)
         for form in ("registers", "firmware", "json", "csv", "miluv", "ros-yaml")
     ),
-    ("calib export {c.json} --to c-header -o out.h", 100),
-    ("calib localize {f.uwb} -c {c.json} --tum out", 1_000),
-    ("calib compare {c.json} {five.json} --figures out", 1_000),
+    ("calib export {calibration.json} --to c-header -o out.h", 100),
+    ("calib localize {flight.uwb} -c {calibration.json} --tum out", 1_000),
+    ("calib compare {calibration.json} {others.json} --figures out", 1_000),
 )
 
 SAME = {
@@ -134,13 +112,8 @@ def is_path(parameter):
 
 def outputs():
     """Return every output of commands, such as `calib fit --output`."""
-    found = set()
-    for package in ("uwblink", "uwbsim", "calib"):
-        app = importlib.import_module(f"{package}.cli.commands").app
-        for words, command in leaves(typer.main.get_command(app), (package,)):
-            written = [p for p in command.params if p.name in WRITTEN and is_path(p)]
-            found |= {f"{' '.join(words)} {parameter.opts[-1]}" for parameter in written}
-    return found
+    parameters = ((name, parameter) for name, command in commands().items() for parameter in command.params)
+    return {f"{name} {p.opts[-1]}" for name, p in parameters if p.name in WRITTEN and is_path(p)}
 
 
 def of_line(line):
@@ -171,11 +144,9 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(seeds, tmp_path, line, most_
 
 
 @pytest.mark.parametrize("room", [0, 20_000])
-def test_poses_on_a_full_disk_are_refused(flight, tmp_path, room):
-    path = tmp_path / "f.uwb"
-    flown = uwblink.load(flight / "f.uwb")
-    replace(flown, poses=flown.poses[:0]).save(path)
-    source = [word for body in ("ifo001", "ifo002") for word in ("--from", f"{body}={flight / 'tum' / body}.tum")]
+def test_poses_on_a_full_disk_are_refused(seeds, tmp_path, room):
+    path = shutil.copyfile(seeds / "live.uwb", tmp_path / "f.uwb")
+    source = [word for body in ("ifo001", "ifo002") for word in ("--from", f"{body}={seeds / 'tum' / body}.tum")]
     most_bytes = path.stat().st_size + room if room else 1000
     naming = ["everything before is kept", "keep the two together"] if room else ["cannot be written"]
     refuse("uwblink", "poses", path, *source, cwd=tmp_path, most_bytes=most_bytes, naming=naming)
@@ -183,7 +154,7 @@ def test_poses_on_a_full_disk_are_refused(flight, tmp_path, room):
     names = {each.name for each in tmp_path.iterdir()}
     assert {"f.uwb", *(["f.uwb.wal"] if room else [])} <= names <= {"f.uwb", "f.uwb.wal"}
     after, bodies = uwblink.load(path), {"ifo001", "ifo002"} if room else set()
-    assert (set(after.poses.body), len(after.exchanges)) == (bodies, len(flown.exchanges))
+    assert (set(after.poses.body), len(after.exchanges)) == (bodies, len(uwblink.load(seeds / "live.uwb").exchanges))
 
 
 @pytest.mark.parametrize(

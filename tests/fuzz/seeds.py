@@ -199,7 +199,7 @@ def write_seeds(folder: Path) -> None:
 def _write_flights(folder: Path) -> None:
     """Write a scenario, a recording of it, and calibrations from that."""
     scenario = (ROOT / SCENARIO).read_text()
-    (folder / "scenario.toml").write_text(scenario.replace("duration_s = 60.0", "duration_s = 1.5"))
+    (folder / "scenario.toml").write_text(scenario.replace("duration_s = 60.0", "duration_s = 2.0"))
     simulated = uwbsim.simulate(folder / "scenario.toml")
     simulated.save(folder / "flight.uwb")
     calib.fit(simulated).calibration.save(folder / "calibration.json")
