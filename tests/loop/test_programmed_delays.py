@@ -1,6 +1,7 @@
 """Boards are recorded, calibrated, programmed, and recorded again: programmed delays are known and counted once."""
 
 import json
+import math
 import tomllib
 from dataclasses import replace
 from itertools import combinations
@@ -52,11 +53,6 @@ def record(world, path, delays=None, protocol="ss", said=True, duration_s=2.0):
     return path
 
 
-def exported(calibration, to, path):
-    succeed("calib", "export", calibration, "--to", to, "-o", path)
-    return path
-
-
 def totals(path):
     """Return the sum of the programmed delays by tag, read without code of the packages."""
     tags = tomllib.loads(path.read_text())["antenna_delays"]["tags"]
@@ -65,13 +61,11 @@ def totals(path):
 
 def errors_cm(path):
     """Return the mean error of each pair's printed ranges, from the positions of the boards."""
-    found = uwblink.load(path).exchanges
-    by_pair = {}
-    for a, b in combinations(PLACES_M, 2):
-        mine = (found.initiator == a) & (found.target == b)
-        true = np.linalg.norm(np.subtract(PLACES_M[a], PLACES_M[b]))
-        by_pair[a, b] = 100 * (found.range_m[mine].mean() - true)
-    return by_pair
+    x = uwblink.load(path).exchanges
+    return {
+        (a, b): 100 * (x.range_m[(x.initiator == a) & (x.target == b)].mean() - math.dist(PLACES_M[a], PLACES_M[b]))
+        for a, b in combinations(PLACES_M, 2)
+    }
 
 
 @pytest.fixture(scope="module")
@@ -82,10 +76,10 @@ def loop(tmp_path_factory):
     record(world, folder / "first.uwb")
     succeed("calib", "fit", folder / "first.uwb", "-o", folder / "first.json", "--delays-only")
     for to in ("registers", "firmware"):
-        exported(folder / "first.json", to, folder / f"{to}.toml")
+        succeed("calib", "export", folder / "first.json", "--to", to, "-o", folder / f"{to}.toml")
     record(world, folder / "second.uwb", folder / "firmware.toml")
     succeed("calib", "fit", folder / "second.uwb", "-o", folder / "second.json", "--delays-only")
-    exported(folder / "second.json", "firmware", folder / "second.toml")
+    succeed("calib", "export", folder / "second.json", "--to", "firmware", "-o", folder / "second.toml")
     return folder
 
 
@@ -202,8 +196,8 @@ def test_unknown_programmed_delays_give_no_registers(tmp_path):
     (tmp_path / "d.toml").write_text("[antenna_delays]\ntx = 100\nrx = 200\nreply = 300\n")
     words = ("--to", "firmware", "--antenna-delays", tmp_path / "d.toml", "-o", tmp_path / "o.toml")
     succeed("calib", "export", tmp_path / "c.json", *words)
-    for tag, total in totals(tmp_path / "o.toml").items():
-        assert total == 300 + round(-known.delays_ns[tag] * 1e-9 / TICK_S)
+    expected = {tag: 300 + round(-delay * 1e-9 / TICK_S) for tag, delay in known.delays_ns.items()}
+    assert totals(tmp_path / "o.toml") == expected
     rows = tomllib.loads((tmp_path / "o.toml").read_text())["antenna_delays"]["tags"]
     assert all(row["reply"] == row["tx"] for row in rows.values())
 
@@ -215,11 +209,8 @@ def test_simulated_flights_with_programmed_delays_have_the_planted_ones(loop, tm
     text = "".join(f"[antenna_delays.tags.{t}]\ntx = {a}\nrx = {b}\nreply = {a}\n" for t, (a, b) in rows.items())
     (tmp_path / "d.toml").write_text(text)
     succeed(*words, "-o", tmp_path / "b.uwb", "--antenna-delays", tmp_path / "d.toml")
-    planted = []
-    for name in "ab":
-        flight = uwblink.load(tmp_path / f"{name}.uwb")
-        planted.append(flight.meta["planted"]["delays_ns"])
-        found = calib.fit(flight).calibration
-        assert np.ptp(np.array([found.delays_ns[tag] - planted[-1][str(tag)] for tag in rows])) < 0.03
-    for tag, (a, b) in rows.items():
-        assert planted[1][str(tag)] - planted[0][str(tag)] == pytest.approx((a + b - 2 * 16436) * TICK_S * 1e9)
+    flights = [uwblink.load(tmp_path / f"{name}.uwb") for name in "ab"]
+    planted = np.array([[flight.meta["planted"]["delays_ns"][str(tag)] for tag in rows] for flight in flights])
+    fitted = [calib.fit(flight).calibration.delays_ns for flight in flights]
+    assert np.ptp([[one[tag] for tag in rows] for one in fitted] - planted, axis=1).max() < 0.03
+    assert planted[1] - planted[0] == pytest.approx([(a + b - 2 * 16436) * TICK_S * 1e9 for a, b in rows.values()])

@@ -21,10 +21,6 @@ from uwbsim.protocols.comparison import ErrorCurve
 BENCH = "two_boards_on_a_bench/bench"
 
 
-def words(draw):
-    return re.findall(r"<text[^>]*>([^<]*)</text>", figures.picture(draw, "svg").decode())
-
-
 @pytest.mark.parametrize("width", [3.5, 7.16])
 def test_a_room_is_to_scale_within_its_walls(width):
     scenario = uwbsim.load("office/office")
@@ -62,7 +58,8 @@ def test_words_of_a_timing_diagram_do_not_cover_each_other(width, name):
 @pytest.mark.parametrize("name", ["ss", "ds", "ds-alt", "ds-sym"])
 def test_a_timing_diagram_has_every_interval_with_its_length(name):
     scenario = uwbsim.load(BENCH)
-    shown = words(lambda width: timing(width, scenario, name))
+    drawn = figures.picture(lambda width: timing(width, scenario, name), "svg").decode()
+    shown = re.findall(r"<text[^>]*>([^<]*)</text>", drawn)
     three = len(PROTOCOLS[name].messages) == 3
     named = {word[:4] for word in shown if word.startswith("dt")}
     assert named == ({"dt41", "dt32", "dt53", "dt64"} if three else {"dt41", "dt32"})
