@@ -46,17 +46,13 @@ def run(*words: object, cwd: str | os.PathLike[str] | None = None, **how: Any) -
     """
     if how:
         return fork(*words, cwd=cwd, **how)
-    argv, status = list(map(str, words)), 0
-    out, err = io.StringIO(), io.StringIO()
+    argv, out, err = list(map(str, words)), io.StringIO(), io.StringIO()
     printed = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
     caught = warnings.catch_warnings(action="default")
     # The module that runs the tests would give the command its name (`python -m pytest`).
     named = mock.patch.object(sys, "argv", argv), mock.patch.object(sys.modules["__main__"], "__package__", None)
     with contextlib.chdir(cwd or Path.cwd()), printed[0], printed[1], caught, named[0], named[1]:
-        try:
-            importlib.import_module(f"{argv[0]}.cli").main()
-        except SystemExit as end:
-            status = end.code if isinstance(end.code, int) else int(end.code is not None)
+        status = _status(argv[0])
     return subprocess.CompletedProcess(argv, status, out.getvalue(), err.getvalue())
 
 
@@ -166,11 +162,16 @@ def _call(argv: list[str]) -> int:
     sys.argv = argv
     own: Any = sys.modules["__main__"]
     own.__package__, own.__spec__, own.__file__ = "", None, argv[0]
-    main = importlib.import_module(f"{os.path.basename(argv[0])}.cli").main
     try:
-        main()
-    except SystemExit as end:
-        return end.code if isinstance(end.code, int) else int(end.code is not None)
+        return _status(os.path.basename(argv[0]))
     finally:
         threading._shutdown()  # type: ignore[attr-defined]
+
+
+def _status(name: str) -> int:
+    """Call the main function of a command; return the status with which it exits."""
+    try:
+        importlib.import_module(f"{name}.cli").main()
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
     return 0

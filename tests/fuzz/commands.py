@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import random
+import re
 import resource
 import shlex
 import shutil
@@ -45,15 +46,12 @@ def kind_of(rng: random.Random) -> Kind:
 def words_of(kind: Kind, damaged: Path, seeds: Path, out: Path, rng: random.Random) -> list[str]:
     """Return the words of one of the commands of a kind."""
     seldom = kind.seldom and rng.randrange(SELDOM) == 0
-    place = {"{}": str(damaged), "{folder}": str(damaged.parent), "{out}": str(out)}
+    place = {"": str(damaged), "folder": str(damaged.parent), "out": str(out)}
     return [_filled(word, place, seeds) for word in shlex.split(rng.choice(kind.seldom if seldom else kind.commands))]
 
 
 def _filled(word: str, place: dict[str, str], seeds: Path) -> str:
-    for name in place:
-        word = word.replace(name, place[name])
-    head, brace, rest = word.partition("{")
-    return head + str(seeds / rest.rstrip("}")) if brace else word
+    return re.sub(r"\{(.*?)\}", lambda found: place.get(found[1], str(seeds / found[1])), word)
 
 
 def _argument(word: str) -> str:
