@@ -253,13 +253,10 @@ def test_a_terminal_of_80_columns_loses_no_figure(compared, capsys, monkeypatch)
 
 def alternating(rng, time_s, direct_s, reflected_s):
     """Return a mask of reflected times, and their relative position within the state."""
-    begins, reflected, at = [], [], -10 * (direct_s + reflected_s)
-    while at < time_s[-1]:
-        begins.append(at)
-        reflected.append(len(begins) % 2 == 0)
-        at += rng.gamma(2.0, (reflected_s if reflected[-1] else direct_s) / 2)
+    lasting_s = rng.gamma(2.0, np.tile([direct_s, reflected_s], 1000) / 2)
+    begins = np.cumsum(lasting_s) - lasting_s - 10 * (direct_s + reflected_s)
     spell = np.searchsorted(begins, time_s, side="right") - 1
-    return np.array(reflected)[spell], spell, time_s - np.array(begins)[spell]
+    return spell % 2 == 1, spell, time_s - begins[spell]
 
 
 def residuals(rng, time_s, direct_s, reflected_s, core_m=0.04, mean_m=0.4):
@@ -303,11 +300,10 @@ def several(seed, whiles):
     rng = np.random.default_rng(seed)
     time_s = np.arange(0, 300, 0.05)
     parts = [residuals(rng, time_s + 0.005 * k, *pair) for k, pair in enumerate(whiles)]
-    times = np.concatenate([time_s + 0.005 * k for k in range(len(whiles))])
-    pair = np.repeat(np.arange(len(whiles)), len(time_s))
-    order = np.argsort(times, kind="stable")
-    error, state = (np.concatenate([part[k] for part in parts])[order] for k in (0, 1))
-    return reflected_flight(times[order], pair[order], error), state, [r / (d + r) for d, r in whiles]
+    pairs = np.arange(len(whiles))  # which take turns
+    error, state = (np.column_stack([part[k] for part in parts]).ravel() for k in (0, 1))
+    whole = reflected_flight(np.add.outer(time_s, 0.005 * pairs).ravel(), np.tile(pairs, len(time_s)), error)
+    return whole, state, [r / (d + r) for d, r in whiles]
 
 
 @pytest.fixture(scope="module")
