@@ -154,13 +154,11 @@ NOISELESS = ROOT / "scenarios" / "noiseless.toml"
 
 
 def changed(tmp_path, old, new):
-    folder = tmp_path / "nlos_office"
-    folder.mkdir()
-    (folder / "monopole.csv").write_text((OFFICE.parent / "monopole.csv").read_text())
-    text = OFFICE.read_text()
+    path, _ = copy_scenarios(["nlos_office"], tmp_path)
+    text = path.read_text()
     assert old in text
-    (folder / "office.toml").write_text(text.replace(old, new, 1))
-    return folder / "office.toml"
+    path.write_text(text.replace(old, new, 1))
+    return path
 
 
 @pytest.mark.parametrize(
@@ -198,8 +196,7 @@ def test_wrong_worlds_are_refused(tmp_path, old, new, fragments):
 
 def with_antennas(tmp_path, change):
     """Return a scenario whose table of an antenna has other lines."""
-    scenario = changed(tmp_path, "reflection_loss_db = 9.0", "reflection_loss_db = 9.0")
-    table = scenario.parent / "monopole.csv"
+    scenario, table = copy_scenarios(["nlos_office"], tmp_path)
     table.write_text("\n".join(change(table.read_text().splitlines())) + "\n")
     return scenario
 
