@@ -96,7 +96,8 @@ class Runner:
             raise AssertionError(f"no way to run {block.language}; say why not")
 
     def _python(self, block: Block) -> str:
-        with told() as printed:
+        """Run Python; return its output, as on a terminal of 100 columns."""
+        with patch.dict(os.environ, COLUMNS="100"), contextlib.redirect_stdout(io.StringIO()) as printed:
             exec(compile(block.code, f"line {block.line}", "exec"), self.names)  # noqa: S102 - the pages are our own
         return printed.getvalue()
 
@@ -121,13 +122,6 @@ def command(line: str) -> str:
     if output:
         Path(output).write_text(printed, encoding="utf-8")
     return "" if output else printed
-
-
-@contextlib.contextmanager
-def told() -> Iterator[io.StringIO]:
-    """Capture output, as on a terminal of 100 columns."""
-    with patch.dict(os.environ, COLUMNS="100"), contextlib.redirect_stdout(io.StringIO()) as printed:
-        yield printed
 
 
 def compare(printed: str, shown: str) -> None:
