@@ -48,13 +48,11 @@ def test_a_map_knows_the_tables_that_its_reference_has():
 
 def flat(table, above=""):
     """Yield every key of a JSON document with dots; names that users or data choose are in capitals."""
+    free = dict.fromkeys(("delays_ns", "delays_std_ns", "antenna_delays"), "TAG") | {"provenance": "KEY"}
+    free |= {"groups": "NAME", "errors.features": "NAME", "errors.pairs": "PAIR", "pair_offsets": "PAIR"}
     for key, value in table.items():
-        free = dict.fromkeys(("delays_ns", "delays_std_ns", "antenna_delays"), "TAG")
-        free |= {"groups": "NAME", "errors.features": "NAME", "provenance": "KEY"}
-        name = free.get(above, key)
-        name = "PAIR" if above in ("errors.pairs", "pair_offsets") else name
-        dotted = f"{above}.{name}".strip(".")
-        if isinstance(value, dict) and dotted not in ("provenance.KEY",) and value:
+        dotted = f"{above}.{free.get(above, key)}".strip(".")
+        if isinstance(value, dict) and dotted != "provenance.KEY" and value:
             yield from flat(value, dotted)
         elif value != {}:
             yield dotted
@@ -62,20 +60,18 @@ def flat(table, above=""):
 
 def test_the_reference_of_calibrations_has_every_key_of_files_and_no_other():
     flight = calib.sample_flight()
+    ranges = calib.load_ranges(flight)
+    rising = np.random.default_rng(1).poisson(2.0, (len(ranges), 2)).astype(np.float32)
     groups = {"front": [1, 2], "back": [3]}
-    found = set()
-    for settings in ({}, {"groups": groups}, {"constants": "pair"}):
-        calibration = calib.fit(flight, **settings).calibration
-        for one in (calibration, dataclasses.replace(calibration, power_at="reception")):
-            found |= set(flat(json.loads(one.to_json())))
+    fits = [calib.fit(flight, **settings).calibration for settings in ({}, {"groups": groups}, {"constants": "pair"})]
+    fits += [dataclasses.replace(one, power_at="reception") for one in fits]
     matrix = ((0.0,) * 8,) * 8
     patterns = (Pattern((1,), matrix[0], matrix[0], matrix, 0.0),)
     slopes = (TemperatureSlope((1,), 0.002, 0.0, 20.0, (10.0, 30.0)),)
-    found |= set(flat(json.loads(dataclasses.replace(calibration, patterns=patterns, temperatures=slopes).to_json())))
-    ranges = calib.load_ranges(flight)
-    rising = np.random.default_rng(1).poisson(2.0, (len(ranges), 2)).astype(np.float32)
+    fits += [dataclasses.replace(fits[0], patterns=patterns, temperatures=slopes)]
     for some in (ranges[ranges.initiator == 1], dataclasses.replace(ranges, features=rising)):
-        found |= set(flat(json.loads(calib.fit(some).calibration.to_json())))
+        fits += [calib.fit(some).calibration]
+    found = {key for one in fits for key in flat(json.loads(one.to_json()))}
     assert found == {key.name for key in CALIBRATION}
 
 
