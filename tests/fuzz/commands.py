@@ -90,21 +90,18 @@ def prepare(number: int, seeds: Path, place: Path) -> list[str]:
 
 def judge(ended: subprocess.CompletedProcess[str], written: list[Path]) -> str:
     """Return a text on a failure of a command that has ended; "" if there is none."""
-    if ended.returncode < 0:
-        return f"died of signal {-ended.returncode}"
-    if "Traceback (most recent call last)" in ended.stderr:
-        return f"uncaught {ended.stderr.splitlines()[-1][:120]!r}"
-    if ended.returncode not in (0, 1, 2):
-        return f"status {ended.returncode}"
     said = [line for line in ended.stderr.splitlines() if not line.startswith("warning: ")]
-    if ended.returncode == 2:
-        if len(said) != 1 or not said[0].startswith("error: "):
-            return f"an error of {len(said)} lines: {' / '.join(said)[:200]!r}"
-        if not said[0].isprintable():
-            return f"an error that steers the terminal: {said[0][:200]!r}"
-        if written:
-            return "an output beside an error"
-    return ""
+    text, refused = " / ".join(said), ended.returncode == 2
+    in_one_line = len(said) == 1 and text.startswith("error: ")
+    failures = {
+        f"died of signal {-ended.returncode}": ended.returncode < 0,
+        f"uncaught {text[-120:]!r}": "Traceback (most recent call last)" in ended.stderr,
+        f"status {ended.returncode}": ended.returncode not in (0, 1, 2),
+        f"an error of {len(said)} lines: {text[:200]!r}": refused and not in_one_line,
+        f"an error that steers the terminal: {text[:200]!r}": refused and not text.isprintable(),
+        "an output beside an error": refused and bool(written),
+    }
+    return next((failure for failure, there in failures.items() if there), "")
 
 
 def run_case(number: int, seeds: Path, folder: Path) -> tuple[str, int | None]:

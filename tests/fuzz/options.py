@@ -38,14 +38,9 @@ def command_of(words: Sequence[str]) -> str:
 
 def another_option(words: Sequence[str], rng: random.Random) -> list[str]:
     """Return an option of a command, and a value if it takes one."""
-    try:
-        known = commands()[command_of(words)]
-    except StopIteration:
-        return []
-    options = [p for p in known.params if p.opts[0].startswith("-") and p.opts[-1] not in NEVER]
+    known = commands()[command_of(words)].params
+    options = [p for p in known if p.opts[0].startswith("-") and p.opts[-1] not in NEVER]
     if not options:
         return []
-    option = rng.choice(options)
-    if getattr(option, "is_flag", False):
-        return [option.opts[-1]]
-    return [option.opts[-1], rng.choice(rng.choice((NUMBERS, PLAIN, WORDS)))]
+    option, value = rng.choice(options), rng.choice(rng.choice((NUMBERS, PLAIN, WORDS)))
+    return [option.opts[-1], *([] if getattr(option, "is_flag", False) else [value])]

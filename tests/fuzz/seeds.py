@@ -22,7 +22,6 @@ from uwblink.exporters import export_recording
 
 ROOT: Final = Path(__file__).parents[2]
 
-SCENARIO: Final = "scenarios/noiseless.toml"
 NEW_TAG: Final = 6
 
 
@@ -186,10 +185,7 @@ KINDS: Final = (
 def write_seeds(folder: Path) -> None:
     """Write a small sound file of every kind into a folder, so that a case takes hundredths of a second."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in (
-        ("map.toml", MAP), ("known.toml", KNOWN), ("groups.toml", GROUPS), ("plan.toml", PLAN), ("nothing", ""),
-        ("faults.toml", FAULTS),
-    ):  # fmt: skip
+    for name, text in TEXTS.items():
         (folder / name).write_text(text)
     _write_flights(folder)
     _write_tables(folder)
@@ -198,7 +194,7 @@ def write_seeds(folder: Path) -> None:
 
 def _write_flights(folder: Path) -> None:
     """Write a scenario, a recording of it, and calibrations from that."""
-    scenario = (ROOT / SCENARIO).read_text()
+    scenario = (ROOT / "scenarios/noiseless.toml").read_text()
     (folder / "scenario.toml").write_text(scenario.replace("duration_s = 60.0", "duration_s = 2.0"))
     simulated = uwbsim.simulate(folder / "scenario.toml")
     simulated.save(folder / "flight.uwb")
@@ -238,7 +234,9 @@ def _write_forms(folder: Path) -> None:
     """Write files of other forms, and their maps, as the tests of these forms do."""
     constants = "[constants]\nfrom_id = 7\n"
     test_table_forms.write(folder / "form_wide.csv", test_forms.wide_rows("r_AN{}"))
-    (folder / "form_wide.toml").write_text('missing = [-1, "x"]\n[columns]\ntime_s = "t_s"\nfrom_id = "tag"\n' + WIDE)
+    (folder / "form_wide.toml").write_text(
+        'missing = [-1, "x"]\n[columns]\ntime_s = "t_s"\nfrom_id = "tag"\n[wide]\nrange_m = "r_AN{to_id}"\n'
+    )
     test_forms.lines(folder / "form_uart.log", test_forms.lec)
     (folder / "form_log.toml").write_text(f'line = "dwm1001-lec"\nchip = "dw1000"\n{constants}')
     elements = [[{"anchor": r.anchor, "range_m": r.range_m} for r in some] for some in test_forms.ROUNDS]
@@ -254,11 +252,8 @@ def _tag(tag: uwblink.Tag) -> str:
     return f'[[tags]]\nid = {tag.tag}\nbody = "{tag.body}"\nlever_arm_m = {list(tag.lever_arm_m)}\n'
 
 
-WIDE: Final = """[wide]
-range_m = "r_AN{to_id}"
-"""
-
-KNOWN: Final = """known = "plane"
+TEXTS: Final = {
+    "known.toml": """known = "plane"
 
 [[distances]]
 between = [1, 3]
@@ -273,14 +268,12 @@ position_m = [1.0, 2.0, 0.5]
 name = "first"
 start_s = 0.0
 end_s = 2.0
-"""
-
-GROUPS: Final = """[groups]
+""",
+    "groups.toml": """[groups]
 front = [1, 2, 3]
 back = [4, 5, 6]
-"""
-
-PLAN: Final = """[sweep]
+""",
+    "plan.toml": """[sweep]
 scenario = "scenario.toml"
 protocols = ["ss", "ds"]
 ranges = 5
@@ -288,16 +281,14 @@ seeds = 1
 
 [vary]
 "radio.rx_noise_ps" = [10.0, 100.0]
-"""
-
-FAULTS: Final = """[[faults]]
+""",
+    "faults.toml": """[[faults]]
 kind = "unplug"
 tag = 1
 at_s = 0.001
 for_s = 0.002
-"""
-
-MAP: Final = """protocol = "ds"
+""",
+    "map.toml": """protocol = "ds"
 bits = 32
 
 [columns]
@@ -311,4 +302,6 @@ gt_range_m = "gt_range_m"
 stamps = "ticks"
 time = "s"
 distance = "m"
-"""
+""",
+    "nothing": "",
+}
