@@ -47,19 +47,23 @@ def seeds(tmp_path_factory):
     folder = tmp_path_factory.mktemp("seeds")
     whole = changed(folder / "f.uwb").read_bytes()
     calib.fit(folder / "f.uwb").calibration.save(folder / "c.json")
-    (folder / "cut.uwb").write_bytes(whole[: len(whole) // 2])
-    (folder / "again.uwb").write_bytes(whole)
     with duckdb.connect(str(folder / "other.uwb")) as db:
         db.execute("CREATE TABLE planets (name VARCHAR)")
     broken = gzip.compress((HEADER + "\n" + (GOOD + "\n") * 5000).encode(), mtime=0)
-    (folder / "t.csv.gz").write_bytes(broken[:40] + broken[60:80] * 100 + broken[40:])
-    (folder / "r.csv").write_text("time_s,from_id,to_id,range_m\n0.0,1,2,3.0\n")
-    (folder / "log.toml").write_text('line = "{range_m} m"\n[constants]\nfrom_id = 1\nto_id = 2\n')
-    (folder / "zeros.csv").write_bytes(bytes(3000))
-    (folder / "wide.csv").write_text((folder / "r.csv").read_text(), "utf-16")
-    (folder / f"{NO_UTF8}.uwb").write_bytes(whole)
-    (folder / f"{NO_UTF8}.csv").write_text((folder / "r.csv").read_text())
-    (folder / "poses.csv").write_text("time_s,body,x,y,z,qx,qy,qz,qw\n0.0,robot1,0,0,0,0,0,0,1\n")
+    ranges = "time_s,from_id,to_id,range_m\n0.0,1,2,3.0\n"
+    for name, data in {
+        "cut.uwb": whole[: len(whole) // 2],
+        "again.uwb": whole,
+        f"{NO_UTF8}.uwb": whole,
+        "t.csv.gz": broken[:40] + broken[60:80] * 100 + broken[40:],
+        "r.csv": ranges.encode(),
+        f"{NO_UTF8}.csv": ranges.encode(),
+        "wide.csv": ranges.encode("utf-16"),
+        "zeros.csv": bytes(3000),
+        "log.toml": b'line = "{range_m} m"\n[constants]\nfrom_id = 1\nto_id = 2\n',
+        "poses.csv": b"time_s,body,x,y,z,qx,qy,qz,qw\n0.0,robot1,0,0,0,0,0,0,1\n",
+    }.items():
+        (folder / name).write_bytes(data)
     for name in ("p.json", "p.uwb", "p.csv", "p.toml", "p.mcap"):
         os.mkfifo(folder / name)
     (folder / "device.uwb").symlink_to("/dev/zero")

@@ -193,12 +193,9 @@ HOMES = {
 }
 
 
-def numbers(source):
-    return {node.value for node in ast.walk(parsed(source)) if isinstance(node, ast.Constant) and node.value in HOMES}
-
-
 def test_constants_are_written_once():
-    found = [(number, path) for path in FILES for number in numbers(path.read_text(encoding="utf-8"))]
+    nodes = [(node, path) for path in FILES for node in ast.walk(parsed(path.read_text(encoding="utf-8")))]
+    found = [(node.value, path) for node, path in nodes if isinstance(node, ast.Constant) and node.value in HOMES]
     assert sorted((number, path.relative_to(ROOT).as_posix()) for number, path in found) == sorted(HOMES.items())
 
 
