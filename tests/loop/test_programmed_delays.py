@@ -73,18 +73,16 @@ def loop(tmp_path_factory):
     """Recorded as delivered, fitted, exported, programmed, recorded and fitted again."""
     folder = tmp_path_factory.mktemp("loop")
     world = scenario(DELAYS_NS)
-    record(world, folder / "first.uwb")
-    succeed("calib", "fit", folder / "first.uwb", "-o", folder / "first.json", "--delays-only")
-    for to in ("registers", "firmware"):
-        succeed("calib", "export", folder / "first.json", "--to", to, "-o", folder / f"{to}.toml")
-    record(world, folder / "second.uwb", folder / "firmware.toml")
-    succeed("calib", "fit", folder / "second.uwb", "-o", folder / "second.json", "--delays-only")
-    succeed("calib", "export", folder / "second.json", "--to", "firmware", "-o", folder / "second.toml")
+    for name, delays in (("first", None), ("second", folder / "first.toml")):
+        recording, fitted = record(world, folder / f"{name}.uwb", delays), folder / f"{name}.json"
+        succeed("calib", "fit", recording, "-o", fitted, "--delays-only")
+        succeed("calib", "export", fitted, "--to", "firmware", "-o", folder / f"{name}.toml")
+    succeed("calib", "export", folder / "first.json", "--to", "registers", "-o", folder / "registers.toml")
     return folder
 
 
 def test_programmed_delays_are_found_again(loop):
-    once, again = totals(loop / "firmware.toml"), totals(loop / "second.toml")
+    once, again = totals(loop / "first.toml"), totals(loop / "second.toml")
     for tag, delay in DELAYS_NS.items():
         assert once[tag] - 2 * 16436 == pytest.approx(-delay * 1e-9 / TICK_S, abs=1.5)
         assert again[tag] == pytest.approx(once[tag], abs=1)
@@ -160,9 +158,9 @@ def test_stamps_are_those_of_the_firmware(tmp_path, protocol, through):
 def test_recordings_require_the_programmed_delays(loop, tmp_path):
     world = scenario(DELAYS_NS)
     with pytest.raises(uwblink.errors.PlanError, match=r"board 1.*16436"):
-        record(world, tmp_path / "f.uwb", loop / "firmware.toml", said=False)
+        record(world, tmp_path / "f.uwb", loop / "first.toml", said=False)
     assert not list(tmp_path.glob("f.uwb*"))
-    (tmp_path / "some.toml").write_text("\n".join((loop / "firmware.toml").read_text().split("\n\n")[:2]))
+    (tmp_path / "some.toml").write_text("\n".join((loop / "first.toml").read_text().split("\n\n")[:2]))
     with pytest.raises(uwblink.errors.PlanError, match="board 3, 4"):
         record(world, tmp_path / "f.uwb", tmp_path / "some.toml")
     (tmp_path / "unclear.toml").write_text("[antenna_delays]\ntx = 16446\nrx = 16449\n")
