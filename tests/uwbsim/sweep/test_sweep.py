@@ -92,15 +92,6 @@ def test_results_are_rows_with_settings_versions_and_outcomes(alone):
     assert loud > quiet
 
 
-def test_failed_runs_are_rows_and_others_continue(tmp_path):
-    text = HEAD + 'ranges = 100\n[vary]\n"ranging.rate_hz" = [50.0, 99999.0]\n'
-    summary = run_sweep(plan(tmp_path, text), tmp_path / "out", workers=1)
-    assert (summary.done, summary.failed) == (2, 1)
-    good, bad = [r for r in rows(tmp_path / "out") if r["protocol"] != "ss-cfo"]
-    assert (good["status"], bad["status"]) == ("ok", "failed")
-    assert "rate_hz" in bad["error"]
-
-
 @pytest.mark.slow
 def test_a_process_that_dies_is_replaced_and_several_give_the_same_bytes(alone, tmp_path, monkeypatch):
     p, out = alone
@@ -163,17 +154,21 @@ def test_a_dask_cluster_survives_the_death_of_a_worker(tmp_path):
     assert (tmp_path / "out" / "results.csv").read_bytes() == (tmp_path / "alone" / "results.csv").read_bytes()
 
 
-def test_calibrations_are_swept_too(tmp_path):
-    text = HEAD.replace('["ss-cfo", "ds"]', '["ds"]') + 'kind = "calibrate"\n[vary]\n"run.duration_s" = [5, 0.2]\n'
+CALIBRATIONS = HEAD.replace('["ss-cfo", "ds"]', '["ds"]') + 'kind = "calibrate"\n'
+CALIBRATE = CALIBRATIONS + '[vary]\n"run.duration_s" = [1, 2]\n'
+
+
+def test_calibrations_are_swept_too_failed_runs_are_rows_and_others_continue(tmp_path):
+    changes = ('"ranging.rate_hz" = 99999.0', '"run.duration_s" = 5', '"run.duration_s" = 0.2')
+    text = CALIBRATIONS + 'design = "list"\n' + "".join(f"[[list]]\n{change}\n" for change in changes)
     summary = run_sweep(plan(tmp_path, text), tmp_path / "out", workers=1)
-    assert (summary.done, summary.failed) == (2, 1)
-    good, bad = rows(tmp_path / "out")
+    assert (summary.done, summary.failed) == (3, 2)
+    fast, good, short = rows(tmp_path / "out")
+    assert [row["status"] for row in (fast, good, short)] == ["failed", "ok", "failed"]
+    assert ("rate_hz" in fast["error"], "too few" in short["error"]) == (True, True)
     assert float(good["full_robust_std_m"]) < float(good["raw_robust_std_m"])
     assert float(good["delays_rms_ns"]) < 0.3
-    assert "too few" in bad["error"]
 
-
-CALIBRATE = HEAD.replace('["ss-cfo", "ds"]', '["ds"]') + 'kind = "calibrate"\n[vary]\n"run.duration_s" = [1, 2]\n'
 
 STRANGER = """
 from dataclasses import replace
