@@ -267,8 +267,8 @@ def test_poses_are_those_of_the_world_and_do_not_depend_on_the_pieces(tmp_path):
 
 
 def test_served_poses_go_on_after_the_scenario_s_duration(tmp_path):
-    scenario = flight(rate_hz=20.0)  # few enough for a loaded machine at twenty times the time of the boards
-    short = scenario.model_copy(update={"run": scenario.run.model_copy(update={"duration_s": 1.0})})
+    # Few enough for a loaded machine at twenty times the time of the boards.
+    short = uwbsim.load(flight(rate_hz=20.0).model_dump(mode="json"), {"run.duration_s": 1.0})
     with served(short, speed=20.0) as server:
         server.write_poses(tmp_path / "p.csv")
 
