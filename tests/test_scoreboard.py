@@ -15,16 +15,6 @@ pytestmark = pytest.mark.slow
 CM = 100
 
 
-@pytest.fixture
-def folder(tmp_path, request):
-    """A folder with the files of one data set only."""
-    here = tmp_path / "data"
-    here.mkdir()
-    for name in request.param:
-        (here / name).symlink_to(shared(name))
-    return here
-
-
 def table(page):
     """Return the rows of the first table, by ranges and calibration."""
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")]
@@ -48,8 +38,6 @@ def corrected(work, recording, calibration):
 
 
 PAPER = ["icra2023_bias_fpp.csv", "icra2023_published_fits.json"]
-SWARM = ["swarm_broadcast_logs.tar.xz"]
-MILUV = ["miluv_cirObstacles_3_random_0.tar.xz", "miluv_published_calibration.json"]
 
 
 def holds(row, errors):
@@ -62,23 +50,26 @@ def forked(line, *, cwd, **_):
     return processes.run(*line[line.index("-m") + 1 :], cwd=cwd)
 
 
-def written(folder, tmp_path, monkeypatch):
-    """The page of a folder with one data set, and the folder with the files of its commands."""
+@pytest.fixture
+def written(tmp_path, monkeypatch, request):
+    """The page of a folder with the files of one data set, its rows, and the folder with the files of its commands."""
     monkeypatch.setattr("benchmarks.scoreboard.subprocess.run", forked)
-    work = tmp_path / "work"
-    work.mkdir()
-    assert scoreboard.main([str(folder), "--page", str(tmp_path / "page.md"), "--work", str(work)]) == 1
-    (there,) = work.iterdir()
-    return (tmp_path / "page.md").read_text(), there
+    data, work = tmp_path / "data", tmp_path / "work"
+    for folder in (data, work):
+        folder.mkdir()
+    for name in request.param:
+        (data / name).symlink_to(shared(name))
+    assert scoreboard.main([str(data), "--page", str(tmp_path / "page.md"), "--work", str(work)]) == 1
+    page = (tmp_path / "page.md").read_text()
+    return page, table(page), *work.iterdir()
 
 
-@pytest.mark.parametrize("folder", [PAPER], indirect=True)
-def test_rows_are_what_calib_apply_gives_and_data_sets_that_are_absent_are_named(folder, tmp_path, monkeypatch):
-    page, work = written(folder, tmp_path, monkeypatch)
-    rows = table(page)
+@pytest.mark.parametrize("written", [PAPER], indirect=True)
+def test_rows_are_what_calib_apply_gives_and_data_sets_that_are_absent_are_named(written):
+    page, rows, work = written
     raw, ours, _ = corrected(work, "half2.uwb", "half1.json")
     # The samples are biases, so the files have every second one unchanged.
-    bias = np.loadtxt(folder / PAPER[0], delimiter=",", skiprows=1)[1::2, 1]
+    bias = np.loadtxt(shared(PAPER[0]), delimiter=",", skiprows=1)[1::2, 1]
     assert np.sort(raw) == pytest.approx(np.sort(bias), abs=1e-6)
     holds(rows["half2", "none"], raw)
     holds(rows["half2", "ours, by half1"], ours)
@@ -91,10 +82,11 @@ def test_rows_are_what_calib_apply_gives_and_data_sets_that_are_absent_are_named
     assert page.count("```sh") == len(scoreboard.DATA_SETS)
 
 
-@pytest.mark.parametrize("folder", [MILUV], indirect=True)
-def test_a_flight_is_judged_with_the_published_calibration_and_on_what_was_held_out(folder, tmp_path, monkeypatch):
-    page, work = written(folder, tmp_path, monkeypatch)
-    rows = table(page)
+@pytest.mark.parametrize(
+    "written", [["miluv_cirObstacles_3_random_0.tar.xz", "miluv_published_calibration.json"]], indirect=True
+)
+def test_a_flight_is_judged_with_the_published_calibration_and_on_what_was_held_out(written):
+    _, rows, work = written
     flight = "cirObstacles_3_random_0"
     raw, published, sigma = corrected(work, f"{flight}.uwb", "published.json")
     holds(rows[flight, "none"], raw)
@@ -105,10 +97,10 @@ def test_a_flight_is_judged_with_the_published_calibration_and_on_what_was_held_
     assert all(re.fullmatch(r"\d\.\d\d", rows[flight, name][4]) for name in ("none", "authors'"))
 
 
-@pytest.mark.parametrize("folder", [SWARM], indirect=True)
-def test_boards_at_unknown_positions_are_evaluated_within_pairs(folder, tmp_path, monkeypatch):
-    page, work = written(folder, tmp_path, monkeypatch)
-    rows = {name: row for (name, _), row in table(page).items() if "held out" in name}
+@pytest.mark.parametrize("written", [["swarm_broadcast_logs.tar.xz"]], indirect=True)
+def test_boards_at_unknown_positions_are_evaluated_within_pairs(written):
+    page, rows, work = written
+    rows = {name: row for (name, _), row in rows.items() if "held out" in name}
     assert sorted(rows) == ["110-1, held out", "70-1, held out", "90-1, held out"]
     for name, row in rows.items():
         e = load(work / f"{name.split(',')[0]}.uwb").exchanges
