@@ -17,7 +17,6 @@ from uwbsim.world.clocks import LONGEST_RUN_S, SUBTICKS, SUBTICKS_PER_SECOND, Cl
 from uwbsim.world.trajectories import _quaternions, sample
 from uwbsim.world.world import World
 
-BOTH = np.array([0, 1])
 NOMINAL = {
     "white_ppm_sqrt_s": lambda tau: 0.01e-6 / np.sqrt(tau),
     "flicker_ppm": lambda tau: np.full_like(tau, 0.01e-6),
@@ -70,7 +69,7 @@ def test_noise_depends_neither_on_what_else_is_asked_nor_on_how_long_the_run_is(
 
 def test_noisy_clocks_begin_at_their_offset_and_always_change():
     c = clocks(clock_offset_s=1.0, **NOISY)
-    np.testing.assert_array_equal(c.read(BOTH, np.zeros(2, dtype=np.int64)), c.offset)
+    np.testing.assert_array_equal(c.read(np.array([0, 1]), np.zeros(2, dtype=np.int64)), c.offset)
     assert (c.offset // SUBTICKS).tolist() == [63_897_600_000] * 2
     fine = 3 * SUBTICKS_PER_SECOND + np.arange(0, 100_000_000, 1_000_000)
     assert np.diff(c.read(np.zeros(len(fine), dtype=np.int64), fine)).min() > 0.999 * 1_000_000

@@ -21,7 +21,6 @@ from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.reception import AntennaDelays
 
 TYPICAL = {"range_mm_per_k": 2.15, "range_cm_per_v": 5.35}
-WARM = {"model": "warm-up", "start": 23.0, "end": 43.0, "time_constant_s": 5.0}
 
 
 def scenario(tags=({}, {}), bodies=({}, {}), devices=None, places=((0.0, 0.0, 1.0), (4.0, 0.0, 1.0)), **more):
@@ -73,7 +72,8 @@ def test_ranges_change_with_temperature_and_supply(changed, longer_m):
 
 def test_a_warm_up_has_the_time_course_of_the_heat():
     cold, _ = errors(scenario(devices=TYPICAL))
-    error, time_s = errors(scenario(bodies=[{"temperature_c": WARM}] * 2, devices=TYPICAL))
+    warm_up = {"model": "warm-up", "start": 23.0, "end": 43.0, "time_constant_s": 5.0}
+    error, time_s = errors(scenario(bodies=[{"temperature_c": warm_up}] * 2, devices=TYPICAL))
     moved = 0.086 * (1 - np.exp(-time_s / 5.0))
     assert np.mean(error - moved) == pytest.approx(np.mean(cold), abs=0.0005)
     assert np.polyfit(moved, error, 1)[0] == pytest.approx(1, abs=0.02)
@@ -181,10 +181,9 @@ def test_event_loop_and_monte_carlo_agree_on_all_of_it(protocol):
 
 def test_readings_of_power_saturate():
     """Inverses of lifted powers, to the power of 1.5, add to that of the limit: only strong powers saturate."""
-    found = []
-    for at_1m_dbm in (-100.0, -68.0, -40.0):
-        radio = {"quantize": False, "first_path_at_1m_dbm": at_1m_dbm, "sensitivity_dbm": -120.0}
-        found.append(uwbsim.simulate(scenario(radio=radio | {"saturation_dbm": -80.0})).exchanges.fpp1_dbm[0])
+    radio = {"quantize": False, "sensitivity_dbm": -120.0, "saturation_dbm": -80.0}
+    worlds = (scenario(radio=radio | {"first_path_at_1m_dbm": at_1m_dbm}) for at_1m_dbm in (-100.0, -68.0, -40.0))
+    found = [uwbsim.simulate(world).exchanges.fpp1_dbm[0] for world in worlds]
     middle = -80 - 10 / 1.5 * np.log10(1 + 10 ** (-0.15 * ((-68 - 20 * np.log10(4)) + 80)))
     np.testing.assert_allclose(found, [-100 - 20 * np.log10(4), middle, -80.0], atol=2e-3)
     assert middle == pytest.approx(-82.0, abs=0.05), "as strong as the highest: 2 dB below it"
@@ -196,7 +195,6 @@ def test_readings_of_power_saturate():
 PLACES = {"a": (0.0, 0.0, 1.0), "b": (4.0, 0.5, 1.2), "c": (1.5, 3.0, 0.8), "post": (2.0, 0.25, 1.1)}
 # Wide enough that the delayed transmissions of the firmware, 512 ticks apart, shift by whole steps.
 TICKS, LOSS_DB = 512, 3.0
-TAG_OF_LOSS = 2
 GEOMETRIC = {
     "room.reflection_loss_db": None,
     "radio.multipath": {"model": "geometric", "scatterers": 32, "stamp_noise": False},
@@ -233,8 +231,8 @@ def served(world):
 
 
 def weaken_tag(link, ends):
-    """An effect of a plug-in: links of one tag are weaker, and longer by a whole step of the boards' grid."""
-    hit = (np.array(ends.tags()) == TAG_OF_LOSS).any(axis=0)
+    """An effect of a plug-in: links of tag 2 are weaker, and longer by a whole step of the boards' grid."""
+    hit = (np.array(ends.tags()) == 2).any(axis=0)
     loss, way = LOSS_DB * hit, TICKS * METRES_PER_TICK * hit
     powers = {"power_dbm": link.power_dbm - loss, "total_dbm": link.total_dbm - loss}
     return replace(link, excess_m=link.excess_m + way, **powers)
