@@ -1,5 +1,6 @@
 """Help on a terminal of 80 columns: complete texts, panels, examples that parse, completion, speed."""
 
+import importlib
 import json
 import os
 import re
@@ -16,20 +17,17 @@ from typer import rich_utils
 import calib
 import uwblink
 import uwbsim
-from calib.cli.commands import app as calib_app
 from calib.cli.judging import spread_tests
 from calib.cli.shared import with_flags
 from calib.fitting import known_losses
 from tests import processes
 from uwblink.cli import shared
-from uwblink.cli.commands import app as uwblink_app
 from uwblink.exporters import EXPORTERS
 from uwbsim.cli.commands import UWBSIM_FLAGS
-from uwbsim.cli.commands import app as uwbsim_app
 
 COMMANDS: dict[str, Any] = {
-    name: typer.main.get_command(app)
-    for name, app in (("uwblink", uwblink_app), ("uwbsim", uwbsim_app), ("calib", calib_app))
+    name: typer.main.get_command(importlib.import_module(f"{name}.cli.commands").app)
+    for name in ("uwblink", "uwbsim", "calib")
 }
 
 

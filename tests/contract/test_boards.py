@@ -20,8 +20,6 @@ from uwblink.wire import messages as m
 from uwblink.wire.codec import Decoder
 from uwbsim.boards.virtual_board import VirtualPorts
 
-ABSENT = 9
-
 
 @pytest.fixture(params=["virtual", "terminal", "real"])
 def pair(request):
@@ -101,7 +99,7 @@ def test_the_target_reports_the_same_numbers_when_asked_to(one, two, protocol):
 
 def test_an_absent_target_fails_with_the_board_s_own_line(one):
     with pytest.raises(RangingFailedError, match="COMMANDED TASK FAILED AFTER 5 ATTEMPTS"):
-        one.range(ABSENT)
+        one.range(9)
     assert one.request(m.GetId()) == m.IdReport(one.id)
 
 

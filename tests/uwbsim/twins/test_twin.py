@@ -398,8 +398,7 @@ def antennas():
         "fading": {"std_db": 1.5, "life_s": 0.1},
         "outages": {"share": 0.1, "life_s": 0.2},
     }
-    tables = world(40.0, seed=8, rate_hz=240.0, radio=radio, bodies=bodies, tags=tags)
-    return tables | {"radio": {key: value for key, value in tables["radio"].items() if value is not None}}
+    return world(40.0, seed=8, rate_hz=240.0, radio=radio, bodies=bodies, tags=tags)
 
 
 @pytest.fixture(scope="module")
