@@ -36,23 +36,16 @@ def chromium(*arguments, profile):
     return subprocess.run(words, check=True, capture_output=True, text=True, timeout=180).stdout
 
 
-def measured(page, width, folder):
-    """Return widths of window and page in pixels, and the smallest texts, for an HTML page (text) in a window of a
-    width.
-    """
+def lies_well(page, width, folder):
+    """Assert that nothing of an HTML page (text) exceeds a window of a width, and that all text is large enough."""
     path, frame = folder / f"measured-{width}.html", folder / f"frame-{width}.html"
     path.write_text(page.replace("</body>", MEASURE))
     frame.write_text(FRAME.format(name=path.name, width=width))
     words = ("--virtual-time-budget=10000", "--window-size=1400,2000", "--dump-dom", frame.as_uri())
-    found = chromium(*words, profile=folder / "profile")
-    told = re.search("<output>(.*?)</output>", found, re.DOTALL)
-    assert told, found[-500:]
-    return json.loads(unescape(told[1]))
-
-
-def lies_well(page, width, folder):
-    """Assert that nothing exceeds the window, and that all text is large enough."""
-    found = measured(page, width, folder)
+    dumped = chromium(*words, profile=folder / "profile")
+    told = re.search("<output>(.*?)</output>", dumped, re.DOTALL)
+    assert told, dumped[-500:]
+    found = json.loads(unescape(told[1]))
     assert found["inner"] == width
     assert found["page"] <= width, found["wide"][:5]
     assert found["wide"] == []

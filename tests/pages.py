@@ -52,8 +52,8 @@ class Block:
 
 def pages() -> list[Path]:
     """Return the pages that are not generated."""
-    found = (path for path in DOCS.rglob("*.md") if not {"_build", "generated"} & set(path.relative_to(DOCS).parts))
-    return sorted(found)
+    generated = {"_build", "generated"}
+    return sorted(path for path in DOCS.rglob("*.md") if not generated & set(path.relative_to(DOCS).parts))
 
 
 def blocks(path: Path) -> list[Block]:
@@ -135,8 +135,7 @@ def compare(printed: str, shown: str) -> None:
 
 def masked(text: str) -> str:
     """Return words with # in place of numbers, without rules of tables and padding."""
-    bare = NUMBER.sub("#", text)
-    return " ".join(word for word in re.sub(r"[─━]+", "", bare).split())
+    return " ".join(re.sub(r"[─━]+", "", NUMBER.sub("#", text)).split())
 
 
 def outline(draw: figures.Draw, width_in: float, kinds: Iterable[str], salt: str = "") -> dict[str, bytes]:

@@ -12,10 +12,6 @@ from uwblink.pages import figures
 
 mpl.use("Agg")
 
-FLIGHT = "uwbsim run scenarios/icra2023/train.toml -o train.uwb --set run.duration_s=12"
-TEST = "uwbsim run scenarios/icra2023/test1.toml -o test.uwb --set run.duration_s=8"
-FIT = "calib fit train.uwb -o calibration.json"
-
 
 @pytest.fixture(scope="session")
 def recordings(tmp_path_factory):
@@ -25,7 +21,11 @@ def recordings(tmp_path_factory):
         (folder / name).symlink_to(pages.ROOT / name)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        for line in (FLIGHT, TEST, FIT):
+        for line in (
+            "uwbsim run scenarios/icra2023/train.toml -o train.uwb --set run.duration_s=12",
+            "uwbsim run scenarios/icra2023/test1.toml -o test.uwb --set run.duration_s=8",
+            "calib fit train.uwb -o calibration.json",
+        ):
             pages.command(line)
     return folder
 
