@@ -23,8 +23,8 @@ from benchmarks.nlos import (
 from calib import evaluate, fit, load_calibration, load_ranges
 from calib.data.ranges import concatenate
 from calib.evaluation.statistics import pair_rows
-from tests import processes
 from tests.calib import synthetic
+from tests.processes import succeed
 from tests.shared_data import shared
 from uwblink import SPEED_OF_LIGHT, Recording
 from uwblink import load as load_recording
@@ -174,15 +174,15 @@ def test_a_flight_through_encode_and_decode_calibrates_to_the_same_bytes(tmp_pat
     for name, more in (("direct", []), ("wire", ["--through-wire"])):
         (tmp_path / name).mkdir()
         flight = tmp_path / name / "flight.uwb"
-        processes.succeed("uwbsim", "run", "icra2023/train", "-o", flight, "--set", "run.duration_s=20", *more)
-        processes.succeed("calib", "fit", flight, "-o", tmp_path / name / "c.json")
+        succeed("uwbsim", "run", "icra2023/train", "-o", flight, "--set", "run.duration_s=20", *more)
+        succeed("calib", "fit", flight, "-o", tmp_path / name / "c.json")
     assert (tmp_path / "direct" / "c.json").read_bytes() == (tmp_path / "wire" / "c.json").read_bytes()
-    processes.succeed("uwblink", "replay", tmp_path / "wire" / "flight.uwb", "-o", tmp_path / "wire" / "again.uwb")
+    succeed("uwblink", "replay", tmp_path / "wire" / "flight.uwb", "-o", tmp_path / "wire" / "again.uwb")
 
 
 def test_a_flight_in_which_nothing_is_received_goes_through_the_wire(tmp_path):
     short = ["--set", "run.duration_s=1", "--set", "radio.sensitivity_dbm=0"]
-    processes.succeed("uwbsim", "run", "icra2023/train", "-o", tmp_path / "f.uwb", "--through-wire", *short)
+    succeed("uwbsim", "run", "icra2023/train", "-o", tmp_path / "f.uwb", "--through-wire", *short)
     flight = load_recording(tmp_path / "f.uwb")
     assert len(flight.exchanges) == 0 < len(flight.faults)
 
@@ -190,16 +190,12 @@ def test_a_flight_in_which_nothing_is_received_goes_through_the_wire(tmp_path):
 # The whole loop on the icra2023 scenarios: simulate, fit, evaluate, and compare with the planted values.
 
 
-def run(*words):
-    return processes.succeed(*words).stdout
-
-
 @pytest.fixture(scope="module")
 def flights(tmp_path_factory):
     folder = tmp_path_factory.mktemp("icra2023")
     for name in ("train", "test1", "test2"):
-        run("uwbsim", "run", f"icra2023/{name}", "-o", folder / f"{name}.uwb")
-    run("calib", "fit", folder / "train.uwb", "-o", folder / "calibration.json")
+        succeed("uwbsim", "run", f"icra2023/{name}", "-o", folder / f"{name}.uwb")
+    succeed("calib", "fit", folder / "train.uwb", "-o", folder / "calibration.json")
     return folder
 
 
@@ -230,13 +226,13 @@ def test_planted_delays_and_curve_are_found_within_30_ps_and_5_mm_rms_and_sigma_
 
 
 def evaluated(recording, calibration):
-    return json.loads(run("calib", "evaluate", recording, "-c", calibration, "--json"))
+    return json.loads(succeed("calib", "evaluate", recording, "-c", calibration, "--json").stdout)
 
 
 @pytest.mark.slow
 def test_each_stage_of_the_recipe_reduces_the_errors(flights, tmp_path):
     recipe = tmp_path / "sequential.json"
-    run("calib", "fit", flights / "train.uwb", "-o", recipe, "--sequential")
+    succeed("calib", "fit", flights / "train.uwb", "-o", recipe, "--sequential")
     for name in ("test1", "test2"):
         mean = {}
         for calibration in (recipe, flights / "calibration.json"):
@@ -258,8 +254,8 @@ def test_fit_does_not_read_what_was_planted(flights, tmp_path):
         target.append("tags", source.tags())
         target.append("poses", source.poses())
         target.append("exchanges", source.exchanges())
-    run("calib", "fit", copy, "-o", tmp_path / "copy.json")
-    run("calib", "fit", flights / "test1.uwb", "-o", tmp_path / "whole.json")
+    succeed("calib", "fit", copy, "-o", tmp_path / "copy.json")
+    succeed("calib", "fit", flights / "test1.uwb", "-o", tmp_path / "whole.json")
     assert (tmp_path / "copy.json").read_bytes() == (tmp_path / "whole.json").read_bytes()
 
 

@@ -25,9 +25,6 @@ from uwbsim.scenario.radio import BIAS
 
 PAGE = (ROOT / "docs" / "without-motion-capture.md").read_text(encoding="utf-8")
 SCENARIO = ROOT / "scenarios" / "string" / "string.toml"
-SHORTER = ("--duration 30", "--duration 9")
-"""Changes of the commands for the test: six ranges per pair instead of twenty."""
-
 AT_REFERENCE_M = float(
     BSpline(BIAS["icra2023"]["knots"], BIAS["icra2023"]["coefficients"], 3)(1.0)  # the lifted power of -82 dBm
 )
@@ -74,7 +71,8 @@ def done(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setattr(figures, "drawn", pages.outline)
-        for name, *words in (shlex.split(line.replace(*SHORTER)) for line in COMMANDS):
+        # Six ranges per pair instead of twenty.
+        for name, *words in (shlex.split(line.replace("--duration 30", "--duration 9")) for line in COMMANDS):
             if words[0] == "serve":
                 bench = Bench(words[1], words[words.index("--link-dir") + 1])
                 patch.setattr("uwblink.boards.record.SerialPorts", lambda ports=bench.ports: ports)
