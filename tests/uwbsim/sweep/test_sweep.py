@@ -63,13 +63,6 @@ def test_a_latin_hypercube_has_one_value_in_each_part_of_each_axis(tmp_path):
     assert abs(np.corrcoef(np.log(noise), delay)[0, 1]) < 0.6, "axes are shuffled apart"
 
 
-def test_a_list_is_taken_as_it_is(tmp_path):
-    p = plan(
-        tmp_path, HEAD + 'design = "list"\n[[list]]\n"radio.rx_noise_ps" = 5.0\n[[list]]\n"ranging.rate_hz" = 20\n'
-    )
-    assert [p.run(k).values for k in range(2)] == [{"radio.rx_noise_ps": 5.0}, {"ranging.rate_hz": 20}]
-
-
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
     folder = tmp_path_factory.mktemp("alone")
