@@ -161,14 +161,6 @@ def test_nan_and_infinity_are_printed_like_the_processor(value, printed):
     assert printed_float(value) == printed
 
 
-@pytest.mark.parametrize("raw", [b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", b"\x00\x00\x80\xff", b"\xff\xff\x7f\x7f"])
-def test_nan_does_not_stop_the_bench(raw, ports):
-    ports.bench.boards[1].write(b"C03|1|a|1|" + raw + b"|\x01\x00x\r")
-    ports.bench.advance(5 * NS_PER_MS)
-    assert ports.transfers[0][2].startswith(b"R03|0|1|a|1|")
-    assert Board(ports.port(2)).id == 2
-
-
 # No byte of a client stops the bench or another board: six thousand commands, correct, wrong and damaged.
 
 
