@@ -62,11 +62,11 @@ def floors(graph: Rooms) -> list[list[str]]:
     return found
 
 
-def drawing(root: Path = ROOT) -> str:
+def drawing() -> str:
     """Return a text from the top layer down: each room with the rooms below it that it imports."""
     lines = []
     for package in PACKAGES:
-        graph = rooms(package, root)
+        graph = rooms(package)
         lines.append(package)
         for level, names in reversed([*enumerate(floors(graph))]):
             for k, name in enumerate(names):

@@ -95,15 +95,16 @@ def test_standard_deviation_follows_the_formula(protocol, noise_ps):
 # Plans: order and times of exchanges, and their success.
 
 
-def ring(count=6, **ranging):
-    angle = 2 * np.pi * np.arange(count) / count
-    places = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), np.ones(count)]).tolist()
+def ring(**ranging):
+    """Return six tags on a circle, each of which ranges with the next."""
+    angle = np.pi / 3 * np.arange(6)
+    places = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), np.ones(6)]).tolist()
     return Scenario.model_validate(
         {
             "run": {"seed": 5, "duration_s": 20.0},
-            "ranging": {"rate_hz": 60.0, "pairs": [(k, (k + 1) % count) for k in range(count)], **ranging},
+            "ranging": {"rate_hz": 60.0, "pairs": [(k, (k + 1) % 6) for k in range(6)], **ranging},
             "bodies": [{"name": str(k), "motion": {"model": "static", "position_m": p}} for k, p in enumerate(places)],
-            "tags": [{"id": k, "body": str(k)} for k in range(count)],
+            "tags": [{"id": k, "body": str(k)} for k in range(6)],
         }
     )
 
@@ -123,8 +124,8 @@ def test_aloha_is_random_at_the_rate():
     assert np.std(gaps) == pytest.approx(np.mean(gaps), rel=0.15)
 
 
-def success(plan, count=6, rate=60.0, **more):
-    result = simulate(ring(count, plan=plan, rate_hz=rate, **more))
+def success(plan, rate=60.0, **more):
+    result = simulate(ring(plan=plan, rate_hz=rate, **more))
     return len(result.exchanges) / (len(result.exchanges) + len(result.faults))
 
 
@@ -163,8 +164,8 @@ def test_frames_last_as_long_as_on_the_boards(length, us):
     assert exchange_air_s(DS, 128) * 1e6 == pytest.approx(177.37 + 174.29 + 194.81, abs=0.02)
 
 
-def slot(number, at_us, initiator, target, heard=(True, True, True), reply_us=305, final_us=1538, pause_us=0):
-    return number, at_us * US, initiator, target, pause_us * US, heard, (0, reply_us * US, final_us * US)
+def slot(number, at_us, initiator, target, heard=(True, True, True), final_us=1538, pause_us=0):
+    return number, at_us * US, initiator, target, pause_us * US, heard, (0, 305 * US, final_us * US)
 
 
 def played(hosts, powers=None, progress=None):

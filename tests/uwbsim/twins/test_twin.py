@@ -331,8 +331,8 @@ def test_durations_are_those_of_the_states(made, reflected_found):
     assert reflected_found.life_s == pytest.approx(np.average(lives, weights=list(map(np.var, pairs))), rel=0.2)
 
 
-def integral_s(centred, step_s, longest_s=3.0):
-    lags = range(1, round(longest_s / step_s))
+def integral_s(centred, step_s):
+    lags = range(1, round(3.0 / step_s))
     correlation = [np.mean(centred[k:] * centred[:-k]) / np.mean(centred**2) for k in lags]
     first = next((k for k, value in enumerate(correlation) if value < 0.02), len(correlation))
     return step_s * (0.5 + sum(correlation[:first]))

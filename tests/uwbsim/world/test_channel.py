@@ -331,17 +331,13 @@ MODEL = {
 }
 
 
-def states_world(duration_s=10.0, rate_hz=150.0, get_cir=False, passive=(), who=tuple(EXPECTED), **model):
-    quiet = {"rx_noise_ps": 0.0, "skew_noise_ppm": 0.0, "quantize": False, "first_path_at_1m_dbm": -72.0}
-    return uwbsim.load(
-        {
-            "run": {"duration_s": duration_s, "seed": 8},
-            "ranging": {"rate_hz": rate_hz, "pairs": [list(p) for p in who], "get_cir": get_cir},
-            "radio": quiet | {"multipath": MODEL | model},
-            "mocap": {"rate_hz": 2.0},
-            "bodies": [{"name": n, "motion": {"model": "static", "position_m": p}} for n, p in PLACES.items()],
-            "tags": [{"id": k + 1, "body": n, "passive": k + 1 in passive} for k, n in enumerate(PLACES)],
-        }
+def states_world(duration_s=10.0, rate_hz=150.0, who=tuple(EXPECTED), **model):
+    return scenario(
+        tuple(PLACES.values()),
+        run={"duration_s": duration_s, "seed": 8},
+        ranging={"rate_hz": rate_hz, "pairs": [list(pair) for pair in who]},
+        radio={"skew_noise_ppm": 0.0, "first_path_at_1m_dbm": -72.0, "multipath": MODEL | model},
+        mocap={"rate_hz": 2.0},
     )
 
 

@@ -65,7 +65,8 @@ HOT = [{"temperature_c": 43.0}] * 2
     ],
 )
 def test_ranges_change_with_temperature_and_supply(changed, longer_m):
-    plain, found = (np.mean(errors(scenario(devices=TYPICAL, **more))[0]) for more in ({}, changed))
+    plain = np.mean(errors(scenario(devices=TYPICAL))[0])
+    found = np.mean(errors(scenario(devices=TYPICAL, **changed))[0])
     # The mean of 1000 ranges with 20 ps and whole ticks is known to 0.1 mm.
     assert found - plain == pytest.approx(longer_m, abs=0.0005)
 

@@ -36,9 +36,9 @@ def scenario(*, places=(A, B), motion=None, scatterers=0, stamp_noise=False, rad
     return still(places, (), {"bodies.0.motion": motion} if motion else {}, radio=radio, **more)
 
 
-def world_paths(world, time_s=0.5):
+def world_paths(world):
     """Return lengths in metres and complex amplitudes of all paths, in order of length."""
-    found = World(world).responses.paths((ZERO, ONE), np.array([time_s]))
+    found = World(world).responses.paths((ZERO, ONE), np.array([0.5]))
     there = np.abs(found.amplitude[0]) > 1e-12
     length = found.detour_m[0][there] + np.linalg.norm(np.subtract(A, B))
     order = np.argsort(length)
