@@ -1,4 +1,4 @@
-"""The tables of the fuzzer have the present commands and options; and damaged calibrations, as in its target."""
+"""The tables of the fuzzer have the present commands and options; and damaged calibrations."""
 
 import functools
 import re
@@ -15,7 +15,7 @@ from tests.fuzz.seeds import KINDS
 LINES = sorted({line for kind in KINDS for line in (*kind.commands, *kind.seldom)})
 OF_BOARDS = {f"uwblink {name}" for name in ("ports", "info", "twr", "test", "passive", "send", "cir", "set-delay")}
 OF_BOARDS |= {"uwblink record"}
-"""Commands that do nothing without boards, which `test_bad_input.py` and the decoder's fuzzer test."""
+"""Commands that do nothing without boards, which `test_bad_input.py` and `test_codec.py` test."""
 
 OF_FOLDERS = {"uwblink import miluv"}
 """`tests/uwblink/importers/test_miluv.py` damages each of its files."""

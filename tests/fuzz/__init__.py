@@ -1,1 +1,1 @@
-"""Fuzzing: coverage-guided for the decoder, by mutations of every kind of file for the commands."""
+"""Fuzzing of the commands by mutations of every kind of file and of options."""
