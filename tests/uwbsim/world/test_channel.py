@@ -45,12 +45,6 @@ def sampled(world, now=5_000_000):
     return SampledWorld(World(world)).from_sender(0, now)[ONE]
 
 
-def paths(world, detour_m=0.0):
-    """Return the paths of the first link at the start, as in a response."""
-    (found,) = World(world).paths(ZERO, ONE, ZERO, np.array([detour_m]))
-    return found
-
-
 def first_path_dbm(row):
     """Return the power of the first path by the formula of the chip, from printed taps (User Manual, 4.7.1)."""
     taps = np.array(row.magnitudes, dtype=float)[int(row.first_path_index) + np.arange(1, 4)]
@@ -123,7 +117,8 @@ def test_impulse_responses_follow_the_power_of_the_link(at_1m_dbm):
 
 def test_a_ranges_own_detour_brings_its_echoes_nearer():
     """With a detour of the first path, echoes come sooner after it."""
-    plain, late = (paths(scenario(room=ROOM), detour_m) for detour_m in (0.0, 0.3))
+    world = World(scenario(room=ROOM))
+    (plain,), (late,) = (world.paths(ZERO, ONE, ZERO, np.array([detour_m])) for detour_m in (0.0, 0.3))
     assert late.delay_s[0] == pytest.approx(plain.delay_s[0] - 0.3 / SPEED_OF_LIGHT)
     room = ROOM | {"max_m": [8.0, 4.0, 40.0], "min_m": [-60.0, -60.0, -0.5], "reflection_loss_db": 0.0}
     radio = {"multipath": {"probability": 1.0, "mean_excess_m": 0.2}}
