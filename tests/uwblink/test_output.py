@@ -116,12 +116,6 @@ def test_an_interrupt_that_another_thread_receives_as_a_file_begins_leaves_nothi
 # Ctrl-C: a summary, the right exit status, a closed file, no traceback.
 
 
-def started(*words):
-    environment = os.environ | {"PYTHONFAULTHANDLER": "1"}
-    command = [str(processes.BIN / words[0]), *words[1:]]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
-
-
 def ended(process, number=signal.SIGINT):
     process.send_signal(number)
     try:
@@ -135,7 +129,9 @@ def ended(process, number=signal.SIGINT):
 
 def test_twr_prints_each_line_when_it_comes_and_a_summary_at_the_end():
     with served() as server:
-        process = started("uwblink", "twr", server.names[1], "2", "-n", "1000000", "--json")
+        words = [str(processes.BIN / "uwblink"), "twr", server.names[1], "2", "-n", "1000000", "--json"]
+        environment = os.environ | {"PYTHONFAULTHANDLER": "1"}
+        process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
         # A buffer would keep lines that came with the first one from what is read at the end.
         begun = os.read(process.stdout.fileno(), 65_536).decode()
         assert process.poll() is None, "the line came while it goes on"

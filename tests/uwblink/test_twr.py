@@ -3,6 +3,7 @@
 from dataclasses import replace
 from fractions import Fraction
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -195,15 +196,6 @@ def mean_of_trips(t):
     return (t.dt41 - t.dt32 + t.dt64 - t.dt53) / 4
 
 
-def in_targets_clock(t):
-    """ICRA 2023, eq. (2), with the round trip rescaled instead of the reply."""
-    return (t.dt41 * t.dt53 / t.dt64 - t.dt32) / 2
-
-
-def in_targets_clock_delays(t):
-    return t.dt53 / t.dt64 / 2, np.full_like(t.dt41, 0.5)
-
-
 SYMMETRIC = RangingProtocol(
     "mean-of-trips",
     "DS-TWR, mean of two single-sided trips",
@@ -215,8 +207,9 @@ TARGETS = RangingProtocol(
     "targets-clock",
     "DS-TWR in the target's clock",
     (POLL, ProtocolMessage("target", "rx1", "at once"), ProtocolMessage("target", "tx2", "scheduled")),
-    in_targets_clock,
-    in_targets_clock_delays,
+    # ICRA 2023, eq. (2), with the round trip rescaled instead of the reply.
+    lambda t: (t.dt41 * t.dt53 / t.dt64 - t.dt32) / 2,
+    lambda t: (t.dt53 / t.dt64 / 2, np.full_like(t.dt41, 0.5)),
 )
 
 
@@ -270,23 +263,6 @@ SOON = ProtocolMessage("target", "rx1", "soon")  # type: ignore[arg-type]
 FOURTH = ProtocolMessage("target", "rx3", "at once")
 
 
-def doubled(t):
-    return 2 * mean_of_trips(t)
-
-
-def collapsed(t):
-    return float(np.mean(mean_of_trips(t)))
-
-
-def failing(_t):
-    raise KeyError("dt99")
-
-
-def backwards(t):
-    weights = half_delays(t)
-    return -weights[0], weights[1]
-
-
 @pytest.mark.parametrize(
     ("protocol", "expected"),
     [
@@ -307,10 +283,22 @@ def backwards(t):
         ({"messages": (POLL, SOON)}, "2: found .*timing='soon'.*at once or scheduled"),
         ({"flight_ticks": "(dt41 - dt32) / 2"}, "flight_ticks: found '.*', expected a function"),
         ({"delay_weights": None}, "delay_weights: found None, expected a function"),
-        ({"flight_ticks": doubled}, r"flight_ticks finds 2000 ticks for an exchange without noise of 1000 ticks$"),
-        ({"flight_ticks": collapsed}, r"return shapes \(\) and \(\(2,\), \(2,\)\) for two exchanges"),
-        ({"flight_ticks": failing}, r"fail on an exchange without noise: KeyError\('dt99'\)"),
-        ({"delay_weights": backwards}, "delay_weights leave 936 ticks .* antenna delays of 64 and 0"),
+        (
+            {"flight_ticks": lambda t: 2 * mean_of_trips(t)},
+            r"flight_ticks finds 2000 ticks for an exchange without noise of 1000 ticks$",
+        ),
+        (
+            {"flight_ticks": lambda t: float(np.mean(mean_of_trips(t)))},
+            r"return shapes \(\) and \(\(2,\), \(2,\)\) for two exchanges",
+        ),
+        (
+            {"flight_ticks": mock.Mock(side_effect=KeyError("dt99"))},
+            r"fail on an exchange without noise: KeyError\('dt99'\)",
+        ),
+        (
+            {"delay_weights": lambda t: (-half_delays(t)[0], half_delays(t)[1])},
+            "delay_weights leave 936 ticks .* antenna delays of 64 and 0",
+        ),
         )),
     ],
 )  # fmt: skip
@@ -323,11 +311,9 @@ def test_wrong_protocols_are_refused_in_one_line(protocol, expected):
 def test_ranges_of_known_protocols_look_for_no_plug_ins(monkeypatch):
     registry: Registry[RangingProtocol] = Registry("protocol", "nobody", PROTOCOLS.known(), check_protocol)
 
-    def forbidden(**_group):
-        raise AssertionError("entry points were asked for")
-
-    monkeypatch.setattr("importlib.metadata.entry_points", forbidden)
+    monkeypatch.setattr("importlib.metadata.entry_points", asked := mock.Mock())
     monkeypatch.setattr(twr, "PROTOCOLS", registry)
     for name in ("ss", "ds-sym"):
         assert time_of_flight(exchange(name, 1000, 98_304_000, 98_304_000, 0, 0))[0] / TICK_S == pytest.approx(1000)
     assert len(time_of_flight(exchange("ss", 1000, 98_304_000, 0, 0, 0)[:0])) == 0
+    assert not asked.called

@@ -199,13 +199,9 @@ def test_interrupts(tmp_path, script, status, out, err):
 # The progress line of a command.
 
 
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
 def test_progress_on_a_terminal_is_shown_and_removed(monkeypatch):
-    screen = Terminal()
+    screen = io.StringIO()
+    monkeypatch.setattr(screen, "isatty", lambda: True)
     monkeypatch.setattr(sys, "stderr", screen)
     with shared.waiting("fitting [1]") as update:
         update("drawing")

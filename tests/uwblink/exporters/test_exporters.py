@@ -192,10 +192,9 @@ def messages_of(bag):
 def test_rosbags_reads_standard_messages(recording, tmp_path):
     held = load(recording)
     count = export_recording(recording, tmp_path / "out", to="rosbag2")["rosbag2"]
-    by_topic: dict[str, list[tuple[int, str, Any]]] = {}
-    for topic, *message in messages_of(tmp_path / "out" / "rosbag2"):
-        by_topic.setdefault(topic, []).append(tuple(message))
-    assert sum(len(found) for found in by_topic.values()) == count
+    messages: list[Any] = messages_of(tmp_path / "out" / "rosbag2")
+    by_topic = {topic: [message for name, *message in messages if name == topic] for topic, *_ in messages}
+    assert len(messages) == count
     e = held.exchanges
     chosen = (e.initiator == 2) & (e.target == 5)
     found = by_topic["/uwb/range_2_5"]

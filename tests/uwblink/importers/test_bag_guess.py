@@ -139,10 +139,6 @@ def as_range(types, head, r):
     return types[RANGE](head, 0, 0.1, 0.0, 300.0, r.range_m, 0.0)
 
 
-def as_number(types, _, r):
-    return types[NUMBER](r.range_m)
-
-
 def as_mine(types, head, r):
     return types[MINE](head, str(r.anchor), 1000 * r.range_m, r.power_dbm)
 
@@ -188,7 +184,7 @@ def by_anchor(name, kind, make):
 HEIGHT = {"/height/drone": (RANGE, of_anchor(0, as_range)), "/drone/status": (TEXT, lambda *_: ())}
 POSES = {"/vrpn_mocap/drone/pose": (POSE, posed)}
 RANGES = by_anchor("/uwb/tag7/range_{}", RANGE, as_range)
-NUMBERS = by_anchor("/tag7/uwb_anchor{}", NUMBER, as_number)
+NUMBERS = by_anchor("/tag7/uwb_anchor{}", NUMBER, lambda types, _, r: types[NUMBER](r.range_m))
 FORMS = {
     "Range by anchor": ("b", RANGES | HEIGHT | POSES, "/uwb/tag7/range_{to_id}", ()),
     "Range in ROS 1": ("b.bag", RANGES, "/uwb/tag7/range_{to_id}", ()),
@@ -337,10 +333,8 @@ TEXTS = ["[" * 100_000, '{"a":' * 700 + "1" + "}" * 700, "[1, 2]", '{"ranges": [
 
 @pytest.mark.parametrize("text", TEXTS)
 def test_messages_without_ranges_are_one_line(tmp_path, text):
-    def texts(store, _):
-        return ((START + k * 10**8, store.types[TEXT](text)) for k in range(12))
-
-    bag = bag_of(tmp_path / "b", {"/a/{b": (TEXT, texts)})
+    texts = {"/a/{b": (TEXT, lambda store, _: ((START + k * 10**8, store.types[TEXT](text)) for k in range(12)))}
+    bag = bag_of(tmp_path / "b", texts)
     with pytest.raises(ImportTableError, match=one_line("no topic with ranges")):
         guess_map(bag)
     with suppress(ImportTableError):

@@ -102,10 +102,6 @@ def trek(some, kind="mc"):
     return f"{kind} 0b {hexadecimal} 095f c1 00024bed a7:0"
 
 
-def stamped(some):
-    return f"[{some[0].time_s:.3f}] {with_ids(some)}"
-
-
 def monitored(some):
     """Return lines of a serial monitor, each with its time of day."""
     seconds = f"00:00:{some[0].time_s:06.3f}"
@@ -161,10 +157,6 @@ def with_sentinels(value):
     for k in range(5, 160, 10):
         rows.insert(k, rows[k] | {"range_m": value})
     return rows
-
-
-def shuffled():
-    return np.random.default_rng(1).permutation(long_rows()).tolist()
 
 
 def by_both():
@@ -234,7 +226,9 @@ FORMS = {
     "AT+RANGE": Form(lambda folder: lines(folder / "uart.log", at_range), times=False),
     "AT+RANGE with ids": Form(lambda folder: lines(folder / "uart.txt", with_ids, ["OK"]), times=False),
     "AT+RANGE with powers": Form(lambda folder: lines(folder / "uart.log", with_powers), times=False, powers="rxp"),
-    "a log with times": Form(lambda folder: lines(folder / "uart.log", stamped)),
+    "a log with times": Form(
+        lambda folder: lines(folder / "uart.log", lambda some: f"[{some[0].time_s:.3f}] {with_ids(some)}")
+    ),
     "Arduino prints": Form(prints, TAG, HEXADECIMAL, times=False, powers="rxp"),
     "Arduino prints with times of day": Form(
         lambda folder: lines(folder / "monitor.txt", monitored), TAG, powers="rxp"
@@ -268,7 +262,9 @@ FORMS = {
         of(lambda: [*long_rows(), {"t_s": "Mean", "tag": "", "anchor": "", "range_m": 3.65, "gt_m": ""}]),
         truth=True, noted="1 of 161 rows",
     ),
-    "out of order": Form(of(shuffled), truth=True, noted="are sorted"),
+    "out of order": Form(
+        of(lambda: np.random.default_rng(1).permutation(long_rows()).tolist()), truth=True, noted="are sorted"
+    ),
     "logs of both ends": Form(of(by_both), truth=True, noted="160 of 320 ranges repeat"),
     "ids that are words": Form(
         of(lambda: [row | {"anchor": HEXADECIMAL[row["anchor"]]} for row in long_rows()]), names=HEXADECIMAL, truth=True

@@ -20,10 +20,10 @@ from tests.uwblink.importers.test_table_forms import (
     HEADER,
     as_messages,
     flights,
+    later,
     mapped,
     read_rows,
     read_table,
-    repeated,
     wrapped,
     write,
 )
@@ -266,7 +266,8 @@ def test_memory_does_not_grow_with_what_is_read(tmp_path, monkeypatch, form, at_
     few, many = {"exchanges": (75, 300), "messages": (40, 140), "bag": (42, 92)}[form]
     peaks = []
     for times in (10, few, many):  # the first one includes objects that are created once
-        rows = [row | {"time_s": row["time_s"] + 100 * (k // 60)} for k, row in enumerate(repeated(flights(), times))]
+        # The same exchanges many times, with all clocks later each time, so that no stamps are equal.
+        rows = [later(row, k) | {"time_s": row["time_s"] + 100 * k} for k in range(times) for row in flights()]
         path = tmp_path / (f"{times}.mcap" if form == "bag" else f"{times}.csv")
         path.touch()
         monkeypatch.setattr(bags, "open_bag", lambda path, rows=rows: nullcontext(Bag(path, rows)))

@@ -179,13 +179,9 @@ def test_missing_constellations_are_named(flight, tmp_path):
     assert imported(flight[0], tmp_path, 'constellation = "1"').meta["anchor_constellation"] == "1"
 
 
-@pytest.fixture(scope="module")
-def real(tmp_path_factory):
-    return miluv(tmp_path_factory.mktemp("miluv"))
-
-
 @pytest.mark.slow
-def test_the_real_flight_gives_the_ranges_of_its_boards(real, tmp_path):
+def test_the_real_flight_gives_the_ranges_of_its_boards(tmp_path):
+    real = miluv(tmp_path)
     found = imported(real, tmp_path)
     counts = {"exchanges": 317, "poses": 23443, "overheard": 719, "cirs": 944, "imu": 46454, "height": 7059}
     assert (found.counts(), found.meta["anchor_constellation"]) == (counts, "0")

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -126,16 +127,6 @@ def test_the_command_prints_its_result_and_refuses_wrong_options(flight, copied,
             add_poses(copied, **{"source": flight / "p.csv", "force": True} | more)
 
 
-def scaled(path, factor, output):
-    """Return a table of poses with its positions multiplied."""
-    rows = [line.split(",") for line in path.read_text().splitlines()]
-    for row in rows[1:]:
-        for k in (rows[0].index(name) for name in "xyz"):
-            row[k] = repr(float(row[k]) * factor)
-    output.write_text("\n".join(map(",".join, rows)) + "\n")
-    return output
-
-
 def test_existing_poses_are_replaced_only_with_force(flight, copied):
     for offset, force in (("-3.21", False), ("-3.1", True)):
         add_poses(copied, flight / "p.csv", offset=offset, force=force)
@@ -154,11 +145,12 @@ def test_existing_poses_are_replaced_only_with_force(flight, copied):
     ],
 )
 def test_poses_in_other_units_are_refused(flight, copied, tmp_path, unit, factor, offset):
-    other = scaled(flight / "p.csv", factor, tmp_path / "p.csv")
-    before = copied.read_bytes()
+    table, before = pd.read_csv(flight / "p.csv"), copied.read_bytes()
+    table[[*"xyz"]] *= factor
+    table.to_csv(tmp_path / "p.csv", index=False)
     # With the wrong time, only ratios far from those of any delay show the unit.
     with pytest.raises(errors.ImportTableError, match="p.csv" if offset == "auto" else f"positions are in {unit}"):
-        add_poses(copied, other, offset=offset)
+        add_poses(copied, tmp_path / "p.csv", offset=offset)
     assert copied.read_bytes() == before
 
 
@@ -297,9 +289,7 @@ def test_trajectories_of_several_bodies_and_anchors(recording, tmp_path):
     held = load(recording)
     assert {tag.tag: tag.body for tag in held.tags} == {1: "car", 2: "drone", 9: "anchor9"}
     assert (held.poses.body == "anchor9").sum() == 1
-    e = held.exchanges
-    true_m = distances_m(held.poses, held.tags, e.initiator, e.target, e.time_ns)
-    np.testing.assert_allclose(true_m[:2], [4.0, np.hypot(3.0, 0.1)])
+    np.testing.assert_allclose(truth(recording)[:2], [4.0, np.hypot(3.0, 0.1)])
 
 
 def test_wrong_anchors_are_refused(recording, tmp_path):

@@ -42,11 +42,6 @@ def flights(count=60, third="target"):
     return rows
 
 
-def repeated(rows, times):
-    """Return the same exchanges many times, with all clocks later each time, so that no stamps are equal."""
-    return [later(row, k) for k in range(times) for row in rows]
-
-
 def later(row, ticks):
     """Return the same exchange with both clocks later."""
     return {n: v + ticks if n in HEADER[3:9] else v for n, v in row.items()}
