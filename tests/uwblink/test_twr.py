@@ -110,7 +110,7 @@ def test_a_delay_on_one_side_only_is_taken_out_by_its_weight(protocol, side, kin
 
 
 def test_truncation_is_towards_zero_and_keeps_what_has_four_decimals():
-    assert truncate4(np.array([1.23459, -1.23459, -87.6187, 0.0001])).tolist() == [1.2345, -1.2345, -87.6187, 0.0001]
+    assert truncate4(np.array([1.23459, -1.23459, -94.9998, 0.0001])).tolist() == [1.2345, -1.2345, -94.9998, 0.0001]
 
 
 def test_stamps_belong_to_the_clocks_of_the_paper():
