@@ -235,7 +235,7 @@ def board_range(exchanges: Exchanges) -> Floats:
 def truncate4(values: Floats) -> Floats:
     """Four decimals, cut toward zero, as the boards print numbers (firmware wire format, 0.2)."""
     # Half a unit of float64 noise is added back, so that a value which already has four decimals
-    # (-87.6187) is not cut to the one below (-87.6186).
+    # (-94.9998) is not cut to the next one (-94.9997).
     scaled = values * 1e4
     return np.trunc(scaled + np.copysign(1e-6, scaled)) / 1e4
 
