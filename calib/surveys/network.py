@@ -254,10 +254,11 @@ class Network:
         delays = np.array([self.fixed_ns.get(tag, 0.0) for tag in self.tags])
         # The prior of a known delay is 0.03 mm, far below the error of any result.
         certain = np.array([1e-4 if tag in self.fixed_ns else BOARD_DELAY_STD_NS for tag in self.tags])
+        curves = [] if self.curve is None else [self.curve.precision]
         blocks = [
             ("place", centre.ravel(), np.diag(std.ravel() ** -2)),
             ("delay", delays, np.diag(certain**-2)),
-            *(("curve", np.zeros(len(one.precision)), one.precision) for one in (self.curve,) if one is not None),
+            *(("curve", np.zeros(len(precision)), precision) for precision in curves),
         ]
         ends = np.cumsum([len(start) for _, start, _ in blocks])
         held = np.isin(np.arange(ends[-1]), [*np.flatnonzero(known), *self.held])

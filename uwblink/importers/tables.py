@@ -51,7 +51,7 @@ def opened(path: Path) -> Iterator[io.BufferedReader]:
         raising(ImportTableError, f"{path}: not a CSV table", csv.Error),
         raising(ImportTableError, f"{path}: cannot be read", OSError),
         raising(ImportTableError, f"{path}: broken or truncated gzip", gzip.BadGzipFile, EOFError, zlib.error),
-        raising(ImportTableError, f"{path}: not a text file in UTF-8", UnicodeDecodeError),
+        raising(ImportTableError, f"{path}: not a text file in UTF-8", UnicodeDecodeError, remedy="; save it in UTF-8"),
         gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file,
     ):
         if file.peek(2).startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):

@@ -87,7 +87,7 @@ def endless():
             ("deep JSON", "t.jsonl", b"[" * 100_000 + b"\n", ""),
             ("no gzip", "t.csv.gz", b"no", ""),
             ("UTF-16", "t.csv", b"\xff\xfe\x00", ""),
-            ("neither UTF-8 nor Latin-1", "t.csv", b"time_s,\x80\n0,1\n", "UTF-8"),
+            ("neither UTF-8 nor Latin-1", "t.csv", b"time_s,\x80\n0,1\n", "save it in UTF-8"),
             ("nothing", "t.csv", b"\n", ""),
             ("columns", "t.csv", ",".join(NAMES) + "\n" + ",".join(["1"] * 5000) + "\n", ""),
             ("fields", "t.jsonl", "{" + ", ".join(f'"{name}": 1' for name in NAMES) + "}\n", ""),
