@@ -403,7 +403,7 @@ def finding_of(offset: FoundOffset) -> Finding:
         "size": f"{100 * abs(offset.offset_m):.1f} cm",
         "way": "long" if offset.offset_m > 0 else "short",
         "growth": "much" if offset.offset_m > 0 else "little",
-        "worst": f"delays by up to {max(1e3 * offset.largest_ns, 1):.0f} ps",
+        "worst": f"delays by up to {1e3 * offset.largest_ns:.0f} ps" if offset.largest_ns > 5e-4 else "no delay",
         "p": offset.p_value,
         "own": own,
         "others": others,
