@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 import calib
 import uwbsim
+from benchmarks.layouts import furnish
 from benchmarks.studies import options, outcomes_of, write_section
 from tests.calib.trajectories.sines import flight
 
@@ -36,10 +37,11 @@ def _sines(seed: int, **more: Any) -> Any:
     return flight(seed=seed, **(ERRING | more))
 
 
-def scenario(name: str, seed: int, seconds: float, *, alike: bool = False) -> Any:
+def scenario(name: str, seed: int, seconds: float, *, alike: bool = False, furnished: bool = False) -> Any:
     """Simulate a scenario with another seed and duration, each body with an IMU.
 
-    With `alike`, all tags have the same power, and read powers without an offset.
+    With `alike`, all tags have the same power, and read powers without an offset. A `furnished` room has another layout
+    for each seed.
     """
     table = tomllib.loads((ROOT / "scenarios" / name).read_text(encoding="utf-8"))
     table["run"] |= {"seed": seed, "duration_s": seconds}
@@ -47,6 +49,8 @@ def scenario(name: str, seed: int, seconds: float, *, alike: bool = False) -> An
         body["imu"] = IMU
     for tag in table["tags"] if alike else ():
         tag |= {"tx_power_db": 0.0, "power_offset_db": 0.0}
+    if furnished:
+        furnish(table, seed)
     return uwbsim.simulate(table)
 
 
@@ -87,6 +91,9 @@ WORLDS: Final = {
     ),
     "room, 40 s, known for 10 s": World(
         lambda seed: scenario("room/room.toml", seed, 40.0), {"poses_until_s": 10.0}, False, seeds=12
+    ),
+    "rooms of other layouts, 40 s, known for 10 s": World(
+        lambda seed: scenario("room/room.toml", seed, 40.0, furnished=True), {"poses_until_s": 10.0}, False, seeds=24
     ),
 }
 

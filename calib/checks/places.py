@@ -46,9 +46,11 @@ def place_covariance(
     variance, p_varies = _varying_part(found, slopes, group) if known else (0.0, 1.0)
     of_residuals = [*([p_stays] if len(offsets) else []), *([p_varies] if known else [])]
     p_values = [*of_residuals, *([] if known else [_simultaneous_reflections(found, group)])]
-    if min(p_values) >= BUDGET:
+    # Fits of trajectories have no unknown for constant offsets, which rooms have even if a test does not find them.
+    typical = len(offsets) > 0 and (not known or p_stays < BUDGET)
+    if min(p_values) >= BUDGET and not typical:
         return np.zeros_like(before_ns2), []
-    if p_stays < BUDGET:
+    if typical:
         # The typical size is right within a factor of e.
         middle, width = TYPICAL_OFFSET_M, 1.0
     elif p_varies < BUDGET:
