@@ -310,16 +310,18 @@ def _covariance_and_findings(
     """Return the delays' covariance (tags, tags) including offsets that were found, and findings about those that
     matter.
 
-    `of_places` is the finding on errors of places, if they are certain; `places_ns2` (tags, tags) is their covariance.
+    `of_places` is the finding on errors of places, with a p-value if they are certain; `places_ns2` (tags, tags) is
+    their covariance.
     """
-    if of_places:
+    certain = any(one.p_value is not None for one in of_places)
+    if certain:
         # Offsets of pairs are then random like the others; a single one is not a separate fault.
         findings = [one for one in findings if one.kind != "pair"]
     covariance, matter, places = plain + places_ns2, dict[tuple[str, tuple[str, ...]], FoundOffset](), of_places
     for one in findings:
         moved, large = _largest_shift(one, plain), abs(one.offset_m) > SMALLEST_M
         # True distances of another time or scale change ranges, but hardly delays.
-        cause = one.kind == "shared" and (bool(of_places) or large)
+        cause = one.kind == "shared" and (certain or large)
         if moved > MATTERS:
             covariance = covariance + one.spread_ns2
         if cause and "late" in one.names:

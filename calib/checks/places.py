@@ -35,7 +35,7 @@ def place_covariance(
     found: RangeFit, slopes: Slopes, bodies: Tested, group: Ints, before_ns2: Floats
 ) -> tuple[Floats, list[Finding]]:
     """Return the covariance (tags, tags) that place-dependent errors add to that of the delays, and a finding if they
-    matter.
+    matter, which has a p-value if they are certain.
 
     `bodies` are the slopes of offsets by pair of bodies, whose numbers are `group` (pairs,); `before_ns2` is the
     covariance without places. It contains offsets of bodies if these are fitted.
@@ -73,12 +73,14 @@ def place_covariance(
     # The common part of all delays also depends on the curve, and is far less certain.
     apart = np.eye(len(before_ns2)) - 1 / max(len(before_ns2), 1)
     own, more = (np.diag(apart @ one @ apart) for one in (before_ns2 - included, widening))
-    p_value, matters = _of_all(p_values), np.any(more > np.maximum(own, SMALLEST_NS**2))
-    if p_value >= FIT_LEVELS["places"] or not matters:
+    if not np.any(more > np.maximum(own, SMALLEST_NS**2)):
         return widening - included, []
+    shift = f"may change differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals include this"
+    if (p_value := _of_all(p_values)) >= FIT_LEVELS["places"]:
+        text = "ranges hardly determine constant offsets between two bodies, which walls cause; they"
+        return widening - included, [warning("unknown offsets of bodies", f"{text} {shift}")]
     certain, directions = _of_all(of_residuals) < FIT_LEVELS["places"], "pattern" not in found.model.covariates
-    text = f"{_wrong_ranges(certain, directions)}, which may change differences of delays by "
-    text += f"{1e3 * np.sqrt(more.max()):.0f} ps; intervals include this"
+    text = f"{_wrong_ranges(certain, directions)}, which {shift}"
     return widening - included, [warning("errors of places", text, p_value)]
 
 

@@ -4,7 +4,7 @@ them.
 
 import re
 from dataclasses import replace
-from itertools import product
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -153,6 +153,18 @@ def test_walls_between_bodies_are_named_and_in_the_intervals(between_m):
     assert largest_score(result, {int(tag): delay for tag, delay in planted.items()}) < 2.5
     # Walls of 5 cm shift delays by about 100 ps; without them they are known to half of that.
     assert (max(abs(found[int(tag)] - delay) for tag, delay in planted.items()) > 0.08) == (between_m > 0)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_intervals_of_four_bodies_include_walls_that_no_test_finds(seed):
+    # Four bodies have six distances between them, of which delays absorb the errors of four.
+    body = {tag: min((tag - 1) // 2, 3) for tag in [*DELAYS_NS, 11]}
+    offset = np.random.default_rng(seed).normal(0, 0.02, (4, 4))
+    late = {(a, b): offset[body[a], body[b]] for a, b in combinations(body, 2) if body[a] != body[b]}
+    flown = flight(seconds=6.0, rate=120, seed=seed, anchors=CORNERS[:1], late_m=late)
+    result = calib.fit_from_ranges(flown, poses_until_s=4.0, heading_std_deg=0.0)
+    assert [one.fault for one in result.findings] == ["unknown offsets of bodies", "short recording"]
+    assert np.abs(scores(result)).max() < 2.5
 
 
 @pytest.mark.parametrize("blocked", ["bodies", "pairs"])
