@@ -70,6 +70,11 @@ def check_tag(tag: object) -> None:
         raise BadInputError(f"found {tag!r}, expected the id of a tag, 0 to 65535", parameter="tag")
 
 
+def are_tags(value: object) -> bool:
+    """Return whether a value is a sequence of ids of tags."""
+    return isinstance(value, Iterable) and not isinstance(value, str | bytes) and all(map(is_tag, value))
+
+
 def is_tag(value: object) -> bool:
     """Return whether a value can be the id of a tag."""
     # Ids have 16 bits in recordings. `uwblink.twr.LARGEST_ID` is not used: importing it loads NumPy, too slow for help.
@@ -132,6 +137,8 @@ class CheckedSettings:
                 fits = isinstance(value, Integral) or "int" not in str(one.type)
                 if not (fits and is_number(value) and least <= value <= most):
                     raise BadInputError(f"found {value!r}, expected {expected}", parameter=name)
+            if one.type == "Sequence[int]" and not are_tags(value):
+                raise BadInputError(f"found {value!r:.60}, expected ids of tags, 0 to 65535", parameter=name)
             if name == "fixed_ns":
                 refuse(
                     (

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from calib.errors import BadInputError
-from calib.settings import CheckedSettings, check_choice, refuse
+from calib.settings import CheckedSettings, are_tags, check_choice, refuse
 from uwblink.display import first_few
 from uwblink.settings import setting
 from uwblink.text_files import is_number
@@ -198,6 +198,8 @@ class FlightPlanSettings(CheckedSettings):
             check_choice("imu", self.imu, IMU_GRADES)
         asked, known = self.robots, self.robots is not None
         listed = [(2 * k + 1, 2 * k + 2) for k in range(asked)] if isinstance(asked, int) else asked or ()
+        if not isinstance(listed, Iterable) or isinstance(listed, str) or not all(map(are_tags, listed)):
+            raise BadInputError(f"found {asked!r:.60}, expected the ids of the tags of each robot", parameter="robots")
         robots = tuple(tuple(map(int, tags)) for tags in listed)
         tags, anchors, ranges = [tag for robot in robots for tag in robot], self.anchors, self.seconds * self.rate_hz
         # A mistyped number must not exhaust the memory: 60 tags are 1770 pairs, 200 000 ranges are five flights.
