@@ -63,7 +63,7 @@ class Optimum:
         return {kind: self.x[where] for kind, where in self.layout.where.items()}
 
 
-def maximize(  # noqa: PLR0913 - a search has that many sides
+def maximize(  # noqa: PLR0913 - a search has many settings
     rows: Sequence[Rows],
     priors: Priors,
     x: Floats,

@@ -34,7 +34,8 @@ OF_ERRORS = ("noise", "odds", "detour", "least", "outliers", "long")
 class Part:
     """A share of one parameter of each range: the unknowns `columns` (n, k) of a `kind` times `values` (n, k).
 
-    Columns count within the kind's block. `values` None stands for 1. Ranges with the same `key` have the same columns.
+    Columns count within the kind's block. Without `values`, these are 1. Ranges with the same key (`RangeModel.key`)
+    must have the same columns; values may differ.
     """
 
     parameter: str
@@ -410,8 +411,17 @@ class RangeRows:
 
 
 def _sorted(part: Part, order: Ints, starts: Ints) -> Part:
-    """Return a part in the rows' own order, with columns by block; a single row of columns is for all ranges."""
+    """Return a part in the rows' own order, with columns by block; a single row of columns is for all ranges.
+
+    Raises `ValueError` if ranges of a block have different columns.
+    """
     values = None if part.values is None else np.ascontiguousarray(part.values[order].T)
-    return replace(
-        part, columns=part.columns if len(part.columns) == 1 else part.columns[order[starts[:-1]]], values=values
-    )
+    columns = part.columns
+    if len(columns) > 1:
+        each = columns[order]
+        columns = each[starts[:-1]]
+        if np.any(each != np.repeat(columns, np.diff(starts), axis=0)):
+            raise ValueError(
+                f"{part.kind}: columns differ between ranges of one key; give `values` that are 0 for others"
+            )
+    return replace(part, columns=columns, values=values)

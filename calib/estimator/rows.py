@@ -1,8 +1,9 @@
 """Rows of a fit: measurements as log likelihoods with slopes by the unknowns.
 
 A kind of row is a class with a method `terms` that yields, for some rows at a time, their log likelihood and slopes.
-The search, the covariance and the score tests sum over them. Ranges are one kind (`calib.estimator.range_rows`);
-measurements with normal errors (tapes, anchors, poses, heights) are the other, `NormalRows`.
+The search, the covariance and the score tests sum over them. Kinds are ranges (`calib.estimator.range_rows`), linear
+measurements with normal errors (`NormalRows`: anchors, poses, heights), and others with a class of their own, such as
+lengths by tape (`calib.trajectories.motion`, `calib.surveys.network`).
 """
 
 from __future__ import annotations

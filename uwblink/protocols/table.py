@@ -1,7 +1,7 @@
-"""Ranging protocols: what a row is (messages and formulas), the table of them, and the checks of registered rows.
+"""Ranging protocols: messages and formulas of a protocol, the table of protocols, and checks of registered ones.
 
-A formula maps `Intervals` of n exchanges to ticks (n,), or to a pair of dimensionless weights (n,): the time of flight
-from intervals, and what antenna delays do to it.
+A formula maps `Intervals` of n exchanges to the time of flight in ticks (n,), or to its derivatives by the antenna
+delays of both tags, a pair of weights (n,) without a unit.
 """
 
 from __future__ import annotations

@@ -45,3 +45,15 @@ def test_a_new_kind_of_row_needs_one_class():
     # Sheet and ranges have equal weight: the result is halfway, and its deviation is smaller by the root of two.
     assert value == pytest.approx((alone + 0.003) / 2, abs=0.2 * std)
     assert both == pytest.approx(std / np.sqrt(2), rel=0.1)
+
+
+def test_columns_that_differ_within_a_key_are_refused():
+    # An offset of the second half of a recording by columns: all ranges of a pair have one key.
+    halves = EXAMPLE.replace(
+        "np.zeros((len(kelvin), 1), np.int64)", "(np.arange(len(kelvin)) * 2 // len(kelvin))[:, None]"
+    )
+    halves = halves.replace('("m/K",)', '("first", "second")').replace("np.zeros(1)", "np.zeros(2)")
+    warm = make(CLEAN["short, 30 s"], 12_001).ranges
+    names: dict[str, Any] = {"__name__": "example", "ranges": warm, "temperature_at": temperature_at}
+    with pytest.raises(ValueError, match="warmth: columns differ"):
+        exec(halves, names | {"slope": 0.0, "slope_std": 1.0})  # noqa: S102 - the page is our own
