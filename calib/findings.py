@@ -84,7 +84,7 @@ REMEDIES: Final = {
     "constant power": "record at several distances and attitudes to fit a curve",
     "reference power without effect": "leave it out, or let the fit determine all delays",
     "reference power": "compare the delays only with those at the same power",
-    "too few pairs": "record more tags, or anchors",
+    "no redundant pairs": "record more tags, or anchors",
     "power confounded with distance": "turn the antennas while recording, or fit with `delays_only`",
     # Faults of tags, pairs and true distances.
     "offset of a pair": "record this pair again",

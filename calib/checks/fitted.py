@@ -480,7 +480,7 @@ def _redundancy(model: RangeModel) -> Iterator[Finding]:
         slopes = 0.5 * METRES_A_NS * free_ends(model.pairs, model.tags, model.settings)
         moved_ns = TYPICAL_OFFSET_M * float(np.linalg.norm(np.linalg.pinv(slopes), axis=1).max())
         yield warning(
-            "too few pairs",
+            "no redundant pairs",
             f"{count} pairs are just enough to determine the delays: offsets of pairs of "
             f"{100 * TYPICAL_OFFSET_M:.1f} cm, which walls cause, would change delays by up to {1e3 * moved_ns:.0f} "
             f"ps, which the intervals do not include",

@@ -278,7 +278,7 @@ def _findings(data: Data) -> list[tuple[str, Finding]]:
     if isinstance(data, Ranges):
         return []
     with opened(data) as (name, _):
-        # The fit itself warns of too few pairs.
+        # The fit itself names undetermined delays.
         return [(name, finding) for finding in examine(data) if finding.fault != "too few pairs"]
 
 
