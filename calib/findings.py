@@ -107,7 +107,7 @@ REMEDIES: Final = {
     "time offset of true distances": "check the clocks (`calib doctor` states the difference)",
     "errors of places": "check the lever arms, then record also at other places, or farther from walls: a common error "
     "of all ranges cannot be detected",
-    "unknown offsets of bodies": "record with more robots or anchors",
+    "unknown offsets of bodies": "record more robots or anchors, or their positions for the whole flight",
     "reflections of a pair": "record it again, the delays depend on the other pairs",
     "reflections of a tag": "check for objects near its antenna",
     "supply voltage": "keep the supply constant while boards warm up",

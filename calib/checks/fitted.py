@@ -6,7 +6,7 @@ the intervals always include their variance.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -59,8 +59,12 @@ UNIT = np.ones((1, 1))
 """The derivative of a range by its own offset."""
 
 
-def examine_fit(found: RangeFit) -> tuple[Floats, list[Finding]]:
+def examine_fit(
+    found: RangeFit, undetermined: Sequence[int] = (), *, corrected: bool = False
+) -> tuple[Floats, list[Finding]]:
     """Test a fit against alternatives with one more unknown each.
+
+    Delays of some tags may be `undetermined`; ranges may be `corrected` by a given curve.
 
     Returns the covariance (tags, tags) of the delays in ns^2, which includes the effect of misfits, and findings about
     them.
@@ -89,10 +93,11 @@ def examine_fit(found: RangeFit) -> tuple[Floats, list[Finding]]:
         if one.family.kind in ("pair", "session") and not len(one.family.fitted):
             plain = plain + widening(one)
     places_ns2, of_places = np.zeros_like(plain), list[Finding]()
-    if group is not None and not alone and found.model.curve is not None and found.model.settings.constants == "tag":
+    curved = corrected or found.model.curve is not None
+    if group is not None and not alone and curved and found.model.settings.constants == "tag":
         pairs = next(one for one in tested if one.family.kind == "pair")
         bodies = bodies or [pairs.combined(np.eye(int(group.max()) + 1)[:, group])]
-        places_ns2, of_places = place_covariance(found, slopes, bodies[0], group, plain)
+        places_ns2, of_places = place_covariance(found, slopes, bodies[0], group, plain, undetermined)
     covariance, named = _covariance_and_findings(plain, findings, places_ns2, of_places)
     # Few pairs determine the size of their offsets poorly. Variance that findings added already is not added again.
     optimum = found.searches[0].optimum

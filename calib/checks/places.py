@@ -32,13 +32,14 @@ SIZES_M = np.geomspace(3e-4, 0.2, 60)
 
 
 def place_covariance(
-    found: RangeFit, slopes: Slopes, bodies: Tested, group: Ints, before_ns2: Floats
+    found: RangeFit, slopes: Slopes, bodies: Tested, group: Ints, before_ns2: Floats, undetermined: Sequence[int]
 ) -> tuple[Floats, list[Finding]]:
     """Return the covariance (tags, tags) that place-dependent errors add to that of the delays, and a finding if they
     matter, which has a p-value if they are certain.
 
     `bodies` are the slopes of offsets by pair of bodies, whose numbers are `group` (pairs,); `before_ns2` is the
-    covariance without places. It contains offsets of bodies if these are fitted.
+    covariance without places. It contains offsets of bodies if these are fitted. The finding is about the delays that
+    are not `undetermined`.
     """
     offsets, variances, p_stays = _not_absorbed(bodies)
     # Trajectories absorb errors that vary, which then leave no residuals.
@@ -70,14 +71,15 @@ def place_covariance(
             optimum, optimum.priors.keys.index((OFFSET_OF_BODIES, 0)), optimum.layout.indices(["delay"])
         )
         widening = max(size_m / optimum.priors.deviation(OFFSET_OF_BODIES), 1.0) ** 2 * included
-    # The common part of all delays also depends on the curve, and is far less certain.
-    apart = np.eye(len(before_ns2)) - 1 / max(len(before_ns2), 1)
-    own, more = (np.diag(apart @ one @ apart) for one in (before_ns2 - included, widening))
+    # The common part of all delays also depends on the curve, and is far less certain; so are undetermined delays.
+    which = ~np.isin(found.model.tags, undetermined)
+    apart = (np.eye(len(which)) - which / max(int(which.sum()), 1))[which]
+    own, more = (np.diag(apart @ one @ apart.T) for one in (before_ns2 - included, widening))
     if not np.any(more > np.maximum(own, SMALLEST_NS**2)):
         return widening - included, []
     shift = f"may change differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals include this"
     if (p_value := _of_all(p_values)) >= FIT_LEVELS["places"]:
-        text = "ranges hardly determine constant offsets between two bodies, which walls cause; they"
+        text = "constant errors of all ranges between two bodies, such as by walls, are not well determined, and"
         return widening - included, [warning("unknown offsets of bodies", f"{text} {shift}")]
     certain, directions = _of_all(of_residuals) < FIT_LEVELS["places"], "pattern" not in found.model.covariates
     text = f"{_wrong_ranges(certain, directions)}, which {shift}"

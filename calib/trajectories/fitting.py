@@ -175,11 +175,11 @@ def _result(
     """Return the result of a fit; raises `UnanswerableError` where no delay is determined, without `minimum_norm`."""
     fixed, model, scene = dict(settings.fixed_ns), found.model, top.motion.scene
     refuse_refuted(dict(zip(model.tags, found.delays.tolist(), strict=False)), found.residuals, model.ranges)
-    covariance, findings = examine_fit(found)
-    covariance = variance_factor(scene) * covariance
     own, verdict = _judge_delays(found, top)
     # Splits that the pairs do not determine are fixed, so the covariance is zero along them.
     free = [int(tag) for tag in verdict.named("delay") if tag]
+    covariance, findings = examine_fit(found, free, corrected=known is not None)
+    covariance = variance_factor(scene) * covariance
     undetermined = _undetermined_text(free, [model.tags[k] for k in own], covariance[np.ix_(own, own)], model.free)
     if free and len(free) == len(own) and not flight.minimum_norm:
         raise UnanswerableError(

@@ -167,6 +167,15 @@ def test_intervals_of_four_bodies_include_walls_that_no_test_finds(seed):
     assert np.abs(scores(result)).max() < 2.5
 
 
+def test_the_effect_of_unknown_walls_is_stated_for_delays_that_are_determined():
+    flown = flight(seconds=8.0, rate=120, anchors=CORNERS[:2])
+    result = calib.fit_from_ranges(flown, poses_until_s=4.0, heading_std_deg=0.0, anchors="sought")
+    assert result.calibration.provenance["undetermined"] == [[11, 12]]
+    (text,) = [one.evidence for one in result.findings if one.fault == "unknown offsets of bodies"]
+    # 132 ps for the robots' tags; 1188 ps with the anchors' delays, whose standard errors are above 1 ns.
+    assert float(re.findall(r"by (\d+) ps", text)[0]) < 200
+
+
 @pytest.mark.parametrize("blocked", ["bodies", "pairs"])
 def test_common_reflections_of_two_bodies_are_named(blocked):
     flown = flight(seconds=20.0, rate=120, seed=3, blocked=blocked)
