@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Box = tuple[Floats, Floats]
 MATERIALS: Final = ["drywall", "wood", "brick", "glass"]
+"""Materials of partitions: those of the simulator that are usual in rooms and that waves pass."""
 
 
 def furnish(table: dict[str, Any], seed: int) -> None:

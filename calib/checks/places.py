@@ -79,7 +79,7 @@ def place_covariance(
         return widening - included, []
     shift = f"may change differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals include this"
     if (p_value := _of_all(p_values)) >= FIT_LEVELS["places"]:
-        text = "constant errors of all ranges between two bodies, such as by walls, are not well determined, and"
+        text = "constant errors of the ranges between two bodies, which walls cause, are not well determined, and"
         return widening - included, [warning("unknown offsets of bodies", f"{text} {shift}")]
     certain, directions = _of_all(of_residuals) < FIT_LEVELS["places"], "pattern" not in found.model.covariates
     text = f"{_wrong_ranges(certain, directions)}, which {shift}"

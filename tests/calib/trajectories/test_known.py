@@ -165,6 +165,10 @@ def test_intervals_of_four_bodies_include_walls_that_no_test_finds(seed):
     result = calib.fit_from_ranges(flown, poses_until_s=4.0, heading_std_deg=0.0)
     assert [one.fault for one in result.findings] == ["unknown offsets of bodies", "short recording"]
     assert np.abs(scores(result)).max() < 2.5
+    # Also beside a given curve.
+    given = calib.fit_from_ranges(flown, poses_until_s=4.0, heading_std_deg=0.0, curve_from=result.calibration)
+    assert "unknown offsets of bodies" in [one.fault for one in given.findings]
+    assert np.abs(scores(given)).max() < 2.5
 
 
 def test_the_effect_of_unknown_walls_is_stated_for_delays_that_are_determined():
